@@ -163,7 +163,9 @@ def test_an_effort_in_ampere_is_so_much_torque(
     assert motor.torque_per_effort == per_effort
     text = text.replace("resistance", "torque_per_effort")
     if per_effort is None:
-        with pytest.raises(InputError, match="whose servo measures neither torque nor current; command posi"):
+        with pytest.raises(
+            InputError, match="but its servo measures neither torque nor current; command posi"
+        ):
             compile_text(text)
     else:
         compile_text(text)
@@ -200,8 +202,8 @@ def test_a_file_that_is_missing_or_something_else_is_one_error() -> None:
 
 def test_a_controller_that_needs_motors_is_refused_where_there_are_none(part_plugins: object) -> None:
     (problem,) = problems_in(NEEDING)
-    assert problem.what == "law needs the motor of elbow, which has no motor file"
-    assert problem.fix.startswith("let `dxlrun identify elbow` measure it")
+    assert problem.what == "law needs the motor of elbow, but elbow has no motor file"
+    assert problem.fix.startswith("measure it with `dxlrun identify elbow`")
     assert (problem.mark.line, problem.mark.column) == (9, 62)
     assert problems_in(NEEDING.replace("direction: 1}", "direction: 1, motor: shoulder.yaml}")) == ()
     MOTOR_FILE.write_text(motor_text(replace(MOTOR, model="MX-28"), {}))
@@ -215,10 +217,10 @@ def test_a_controller_that_needs_a_figure_is_refused_where_the_file_lacks_it(par
     compile_text(text)
     MOTOR_FILE.write_text(motor_text(replace(MOTOR, position_gain=None, p_gain=None), {}))
     with pytest.raises(
-        InputError, match="law needs the position_gain of shoulder, which its motor file does"
+        InputError, match="law needs the position_gain of shoulder, missing in its motor file"
     ):
         compile_text(text)
-    with pytest.raises(InputError, match="needs the colour of motors"):
+    with pytest.raises(InputError, match="needs unknown motor data: colour"):
         compile_text(text.replace("position_gain", "colour"))
 
 
@@ -227,7 +229,7 @@ def test_a_controller_of_a_running_robot_or_a_replay_needs_them_too() -> None:
     preparation = Preparation({joint.name: joint for joint in loop.joints}, plugins)
     entry = {"name": "more", "type": "feed_forward", "joints": ["shoulder"]}
     assert preparation.controller(entry, {}, 200.0).joints == ("shoulder",)
-    with pytest.raises(RefusedRequest, match="more needs the motor of elbow, which has no motor file"):
+    with pytest.raises(RefusedRequest, match="more needs the motor of elbow, but elbow has no motor file"):
         preparation.controller(entry | {"joints": ["elbow"]}, {}, 200.0)
     assert with_settings(loop, [Setting("law", ("scale",), 0.5)], plugins) != loop
     with pytest.raises(InputError, match="--set law: law needs the motor of elbow"):

@@ -100,7 +100,7 @@ def test_broken_section_of_plugin_leaves_robots_usable(
     installed, broken = dxlrun.features._installed((plugin,))
     assert installed == FEATURES
     assert broken.keys() == {"lamps", "devices"}
-    assert "another feature has that name" in broken["devices"]
+    assert "another feature has this name" in broken["devices"]
 
 
 @pytest.mark.parametrize(
@@ -192,13 +192,13 @@ def test_key_of_plugin_with_name_of_the_core_is_refused(offer: Offer, name: str,
     _, installed, broken = offer(name, file)
     assert installed == FEATURES
     assert broken == {
-        name: f"the key {name} of offered 1.0 cannot be used: dxlrun has a key of that name; "
+        name: f"the key {name} of offered 1.0 cannot be used: dxlrun has a key with this name; "
         "report it to its author"
     }
 
 
 def test_key_that_a_form_cannot_have_is_refused(offer: Offer) -> None:
-    assert "a key begins with a letter" in offer("_lamps", "joint_key")[2]["_lamps"]
+    assert "does not begin with a letter" in offer("_lamps", "joint_key")[2]["_lamps"]
 
 
 def test_key_that_is_not_the_name_of_its_feature_is_refused(offer: Offer) -> None:
@@ -209,7 +209,7 @@ def test_key_that_is_not_the_name_of_its_feature_is_refused(offer: Offer) -> Non
 
 
 def test_key_of_joints_and_of_servos_is_refused(offer: Offer) -> None:
-    assert "a joint has both" in offer("glow", "joint_key", "servo_key")[2]["glow"]
+    assert "both for joints and for servos" in offer("glow", "joint_key", "servo_key")[2]["glow"]
 
 
 def test_key_before_an_unknown_one_is_the_last(offer: Offer) -> None:

@@ -125,7 +125,7 @@ def test_servos_that_disagree_are_refused_before_any_gets_torque(plan, monkeypat
     with pytest.raises(StartUpError) as caught:
         robot.run()
     assert "the servos of hip disagree by 8.0 deg, more than its tolerance of 3.0 deg" in str(caught.value)
-    assert "ID 3 on bus main has it at 8.0 deg, ID 2 on bus main at 0.0 deg" in str(caught.value)
+    assert "ID 3 on bus main reports 8.0 deg, ID 2 on bus main reports 0.0 deg" in str(caught.value)
     assert not any(on for servo in range(1, 8) for _, on in torque_writes(robot, servo))
     tolerant = replace(
         wrong,
@@ -151,7 +151,7 @@ def test_servos_that_begin_to_disagree_in_the_run_are_one_event_until_they_agree
         (EventCode.SERVOS_DISAGREE, Severity.INFO, "hip"),  # below 2.1, at 1 deg
         (EventCode.SERVOS_DISAGREE, Severity.WARNING, "hip"),
     ]
-    assert "ID 3 on bus main has it at 3.2 deg, ID 2 on bus main at 0.0 deg" in events.list[0][3]
+    assert "ID 3 on bus main reports 3.2 deg, ID 2 on bus main reports 0.0 deg" in events.list[0][3]
     arrays.servo_states.valid[1] = False  # where one stands is not known
     arrays.servo_states.position[2] = 0.0
     arrays.fill_joint_states()
@@ -248,7 +248,7 @@ def test_a_controller_for_one_joint_of_a_wrist_is_not_loaded_in_another_mode(pla
     part = replace(known, name="part", joints=("pitch",), command=("velocity",))
     refusal = robot.robot.manager.load_controller(part)
     assert isinstance(refusal, Refusal)
-    assert "another mode of pitch, but not of roll" in str(refusal.fields["problem"])
+    assert "the mode of pitch, but not of roll" in str(refusal.fields["problem"])
     assert robot.robot.manager.load_controller(replace(part, command=("position",))) == 2
 
 
@@ -364,5 +364,5 @@ def test_a_servo_that_shuts_itself_down_takes_the_torque_of_its_partner(plan, tm
     events = read_log(tmp_path / "run.mcap").events
     texts = [event.text for event in events if event.code == EventCode.TORQUE_OFF]
     assert any(
-        "hip: ID 2 on bus main is limp, so torque goes off on ID 3 on bus main" in one for one in texts
+        "hip: torque is switched off on ID 3 on bus main, as ID 2 on bus main of" in one for one in texts
     )

@@ -80,7 +80,7 @@ def test_a_servo_without_torque_takes_it_from_its_partner_once(joints: Joints, p
     assert joints.servos.switched == [(2, False)]
     ((name, text),) = joints.events.of(EventCode.TORQUE_OFF)
     assert name == "hip"
-    assert "ID 2 on bus main is limp, so torque goes off on ID 3 on bus main" in text
+    assert "torque is switched off on ID 3 on bus main, as ID 2 on bus main of" in text
 
 
 @pytest.mark.parametrize("partner", [Torque.LOST, Torque.REBOOTING, Torque.UNKNOWN])
@@ -127,7 +127,7 @@ def test_servos_of_a_joint_that_differ_in_a_register_are_named_with_their_values
     assert joints.servos.rows == HIP_SERVOS
     for done, value in zip(joints.servos.done, (first, 8), strict=True):
         done("", value)
-    differ = f"its servos differ: ID 2 on bus main has {first}, ID 3 on bus main has 8"
+    differ = f"its servos have different values: ID 2 on bus main has {first}, ID 3 on bus main has 8"
     assert found == [(differ if first != 8 else "", first)]
 
 

@@ -67,7 +67,7 @@ def test_each_run_follows_better_and_a_replay_is_equal(tmp_path):
     assert errors[3] < errors[0] / 10, errors
     assert all(after < before for before, after in itertools.pairwise(errors))
     (text,) = said(log)
-    assert text.startswith("starts with the ")
+    assert text.startswith("starts with its kept state of ")
     report = replay_log(path)
     assert report.same, report
     assert report.messages > 5

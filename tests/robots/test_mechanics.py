@@ -113,7 +113,10 @@ def test_registers_are_those_of_all_servos_of_a_joint_or_of_the_one_that_is_name
     assert isinstance(answers[1], Completion)
     assert answers[1].value == 800
     assert isinstance(answers[2], Refusal)
-    assert "its servos differ: ID 1 on bus main has 800, ID 2 on bus main has 900" in answers[2].text
+    assert (
+        "its servos have different values: ID 1 on bus main has 800, ID 2 on bus main has 900"
+        in answers[2].text
+    )
     assert [answers[number].value for number in (3, 5)] == [900, 850]
 
 

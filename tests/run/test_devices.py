@@ -126,7 +126,7 @@ def test_the_log_is_the_ledger_and_a_lost_device_costs_the_servos_nothing(dozen,
     assert {source for code, source in codes if code == EventCode.DEVICE_LOST} == {"foot", "core"}
     assert [source for code, source in codes if code == EventCode.DEVICE_BACK] == ["foot"]
     assert EventCode.SERVO_LOST not in {code for code, _ in codes}
-    assert ("board", "held to its range 0..1") in {
+    assert ("board", "clamped to its range 0..1") in {
         (event.source, event.text.rpartition(" is ")[2]) for event in log.events
     }
     assert np.nanmax(cycles["device_command"][:, 0]) == 1.0

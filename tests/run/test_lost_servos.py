@@ -224,7 +224,7 @@ def test_all_joints_of_a_group_lose_their_torque_with_one_of_its_servos(built, t
     assert robot.run().reason == "ended"
     assert had == [True, True, False, True]
     (told,) = [event.text for event in read_log(tmp_path / "run.mcap").events if "group" in event.text]
-    assert told == "group neck lost a servo: it is limp until a client requests torque"
+    assert told == "group neck lost a servo: the group is limp until a client requests torque"
 
 
 def test_the_first_reason_to_end_a_run_decides_by_which_policy(built):
@@ -299,7 +299,7 @@ def test_group_becomes_limp_once_however_long_its_servo_stays_away():
         states.valid[:] = True
         states.valid[[*lost]] = False
         monitor.check_cycle(0)
-    sentence = "group arm lost a servo: it is limp until a client requests torque"
+    sentence = "group arm lost a servo: the group is limp until a client requests torque"
     held = [("hold", {0}), ("hold", {0, 1}), ("hold", set()), ("hold", {0})]
     assert actions.done == [("limp", {0, 1}), ("ERROR", sentence), *held]
 

@@ -111,8 +111,8 @@ def test_boards_on_two_lines_are_told_apart(robot):
     [
         ("boards/mine.toml", "boards/yours.toml", "boards/yours.toml of mine cannot be read: No such file"),
         ("toe: -3.5", "heel: -3.5", "mine has no state heel"),
-        ("halt: 1}}", "halt: 1}, noise: {toe: -1}}", "the noise of toe is below 0; write a standard"),
-        ("toe: -3.5", "toe: heavy", "'heavy' is not a value of a state; write a number, in SI units"),
+        ("halt: 1}}", "halt: 1}, noise: {toe: -1}}", "the noise of toe is negative; write a standard"),
+        ("toe: -3.5", "toe: heavy", "'heavy' is not a number; write a number in SI units"),
         ("protocol: 2.0, baud", "protocol: 1.0, baud", "my-board of mine speaks Protocol 2.0, bus main"),
     ],
 )
@@ -131,7 +131,7 @@ def test_a_broken_table_is_named_at_the_robot_file(robot):
     from dxlrun.errors import InputError
 
     (robot.parent / "boards" / "mine.toml").write_text(BOARD.replace("bit = 5", "bit = 2"))
-    with pytest.raises(InputError, match="bit 2 of address 32 is defined twice; correct that file"):
+    with pytest.raises(InputError, match="bit 2 of address 32 is defined twice; correct the file"):
         simulated_robot(robot)
 
 
@@ -207,10 +207,8 @@ def test_a_link_must_be_one_of_the_urdf(tmp_path):
     (tmp_path / "nodding.urdf").write_text(URDF)
     path = tmp_path / "nodding.yaml"
     path.write_text(ON_A_LINK.replace("link: head", "link: haed"))
-    with pytest.raises(
-        InputError, match="imu is on link haed, which the URDF does not have; did you mean head"
-    ):
+    with pytest.raises(InputError, match="link haed of imu is not in the URDF; did you mean head"):
         simulated_robot(path)
     path.write_text(ON_A_LINK.replace("model: {urdf: nodding.urdf}\n", ""))
-    with pytest.raises(InputError, match="imu is on link head, and the file names no URDF"):
+    with pytest.raises(InputError, match="imu is on link head, but the robot file has no URDF"):
         simulated_robot(path)

@@ -13,7 +13,7 @@ WRONG = {
         "11:15: no plug-in offers the sensor type simulated_im of imu; did you mean simulated_imu?"
     ),
     "{type: simulated_imu, link: nose}": (
-        "11:36: imu is on link nose, which the URDF does not have; known: boom, ground, mast, tip"
+        "11:36: link nose of imu is not in the URDF; known: boom, ground, mast, tip"
     ),
     "{type: simulated_imu, link: tip, rate: 0}": "11:47: sensors.imu.rate is 0, but must be at least 0.001",
     "{type: simulated_imu, link: tip, timeout: 5}": "11:50: sensors.imu.timeout: 5 has no unit",
@@ -68,12 +68,12 @@ def test_a_sensor_has_a_name_of_its_own(refusals):
 
 def test_a_simulated_sensor_needs_a_urdf_and_simulated_servos(refusals):
     assert refusals(("model: {urdf: crane.urdf}\n", "")) == [
-        "crane.yaml:11:3: imu senses the motion of link tip, and the file names no URDF; "
+        "crane.yaml:11:3: imu senses the motion of link tip, but the robot file has no URDF; "
         "write `model: {urdf: ...}`"
     ]
     (sentence,) = refusals(("port: sim", "port: /dev/ttyUSB0"))
     assert sentence.startswith(
-        "crane.yaml:11:3: imu senses the simulated body, but bus main has a real port; give a sensor"
+        "crane.yaml:11:3: imu senses the simulated body, but bus main has a real port; choose a real"
     )
 
 

@@ -126,7 +126,7 @@ def test_a_replay_has_the_recorded_samples(crane, tmp_path):
 def test_a_sensor_of_the_real_world_is_refused_on_virtual_time(crane):
     path = crane((IMU, "{type: serial_imu, port: /dev/ttyACM7}"))
     with pytest.raises(
-        InputError, match=r"virtual time needs simulated sensors, but imu \(serial_imu\) measures"
+        InputError, match=r"virtual time needs simulated sensors, but imu \(serial_imu\) is real"
     ):
         VirtualRobot(plan_of(path))
 

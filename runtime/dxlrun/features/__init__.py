@@ -103,13 +103,12 @@ def _find_fault(feature: Feature, found: Container[str]) -> str:
         return f"{type(error).__name__}: {str(error).partition(chr(10))[0]}"
     names = {key.name for key in (*keys, *groups)}
     faults = {
-        "another feature has that name": name in found,
+        "another feature has this name": name in found,
         "no STAGES, form.py, joint_key.py, servo_key.py or policy_key.py declares it": name not in names,
-        f"a file declares {', '.join(sorted(names - {name}))} instead": len(names) > 1,
-        "a key begins with a letter": name.startswith("_"),
-        "dxlrun has a key of that name": any(name in RESERVED[type(key)].split() for key in keys),
-        "it is a key of joints and of servos, and a joint has both": {JointKey, ServoKey}
-        <= {*map(type, keys)},
+        f"its files also declare {', '.join(sorted(names - {name}))}": len(names) > 1,
+        "its name does not begin with a letter": name.startswith("_"),
+        "dxlrun has a key with this name": any(name in RESERVED[type(key)].split() for key in keys),
+        "it is declared both for joints and for servos": {JointKey, ServoKey} <= {*map(type, keys)},
     }
     return next((fault for fault, is_so in faults.items() if is_so), "")
 

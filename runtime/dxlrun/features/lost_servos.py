@@ -39,7 +39,7 @@ ON_LOST_SERVO: PolicyKey[WrittenPolicy] = PolicyKey(
     WrittenPolicy,
     key(
         "Reaction to a lost servo, after 3 missed replies in a row and 50 ms: its controllers hold "
-        "until it answers, or the run ends by these steps.",
+        "until it answers, or the run ends with these steps.",
         "hold",
         "hold",
     ),
@@ -79,7 +79,7 @@ def compile_groups(compilation: Compilation) -> Contribution:
 @event_text(EventCode.POLICY, Severity.ERROR)
 def group_is_limp(group: str) -> str:
     """Return the event that a group was made limp because it lost a servo."""
-    return f"group {group} lost a servo: it is limp until a client requests torque"
+    return f"group {group} lost a servo: the group is limp until a client requests torque"
 
 
 class LostServos:

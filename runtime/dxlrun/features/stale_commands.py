@@ -13,8 +13,8 @@ ON_STALE_COMMAND: PolicyKey[WrittenPolicy] = PolicyKey(
     "on_stale_command",
     WrittenPolicy,
     key(
-        "Reaction to a stream of commands that stopped: its joints hold until the next command, or "
-        "the run ends by these steps.",
+        "Reaction to an interrupted stream of commands: its joints hold until the next command, or "
+        "the run ends with these steps.",
         "hold",
         "hold",
     ),

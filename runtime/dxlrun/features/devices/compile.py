@@ -128,16 +128,16 @@ def _table(file: RobotFile, name: str, device: Device) -> DeviceTable | None:
         return None
     except OSError as error:
         what = f"the control table {device.model} of {name} cannot be read: {error.strerror}"
-        file.error(mark, what, "check the name; it is relative to the folder of this file")
+        file.error(mark, what, "check the path, relative to the folder of this file")
         return None
     except ValueError as error:
         what = f"{device.model} of {name} is not a control table of a device: {error}"
-        file.error(mark, what, "correct that file; docs/how-to/devices.md has its form")
+        file.error(mark, what, "correct the file; docs/how-to/devices.md shows its format")
         return None
     if bus is not None and table.protocol != bus.protocol:
         what = f"{table.model} of {name} speaks Protocol {table.protocol}"
         what = f"{what}, bus {device.bus} Protocol {bus.protocol}"
-        file.error(mark, what, "put it on a bus of its own protocol; a bus cannot be mixed")
+        file.error(mark, what, f"put it on a bus of Protocol {table.protocol}")
         return None
     return table
 
@@ -165,8 +165,8 @@ def _units(items: Mapping[str, ControlItem]) -> dict[str, str]:
 def _read_items(file: RobotFile, name: str, device: Device, table: DeviceTable) -> dict[str, ControlItem]:
     """Return the control table item of each state that a device reads in every cycle, by the state's name."""
     if not device.states and not table.cyclic:
-        what = f"{name} names no states, and the table of {table.model} has no items that are read by default"
-        fix = f"name some under states: {', '.join(table.items)}"
+        what = f"{name} has no states, and {table.model} has no default items"
+        fix = f"list some under states: {', '.join(table.items)}"
         file.error(file.key("devices", name), what, fix)
     written = device.states or tuple(("", item) for item in table.cyclic)
     return _named(file, ("devices", name, "states"), written, table)
@@ -177,11 +177,7 @@ def _written_items(file: RobotFile, name: str, device: Device, table: DeviceTabl
     found = _named(file, ("devices", name, "commands"), device.commands, table)
     for index, (command, item) in enumerate(found.items()):
         if item.access == "R" or item.area == "EEPROM" or item.bit is not None:
-            why = (
-                "is in the EEPROM, and the EEPROM wears out"
-                if item.area == "EEPROM"
-                else "shares its byte with other bits"
-            )
+            why = "would wear out the EEPROM" if item.area == "EEPROM" else "shares its byte with other bits"
             why = "cannot be written" if item.access == "R" else why
             mark = _item_mark(file.description, ("devices", name, "commands"), index, command)
             writable = [
@@ -228,7 +224,7 @@ def _named(
         own = item.name if key == "commands" else item.state
         if (given or own) in found:
             what = f"two {key} of {name} have the name {given or own}"
-            file.error(mark, what, "write NAME: ITEM for each, with names of their own")
+            file.error(mark, what, "write NAME: ITEM for each, with different names")
             continue
         found[given or own] = item
     return found

@@ -41,9 +41,9 @@ def inspect_device(plan: BusPlan, device: DevicePlan, line: Line) -> Program[str
     """Ping a device, read its model number and states; return the problem, empty if there is none."""
     reply = yield from retry(line.ping(device.servo_id))
     if reply.outcome is TransactionOutcome.TIMEOUT:
-        rate = f"that it runs at {plan.baud_rate} bit/s"
+        rate = f"baud rate ({plan.baud_rate} bit/s)"
         remedy = choose_remedy(
-            plan.port, f"check power, cable, ID, and {rate}", simulated=f"check its ID, and {rate}"
+            plan.port, f"check power, cable, ID and {rate}", simulated=f"check its ID and {rate}"
         )
         return f"does not answer: {remedy}"
     if reply.outcome is TransactionOutcome.GARBLED:
@@ -56,19 +56,19 @@ def inspect_device(plan: BusPlan, device: DevicePlan, line: Line) -> Program[str
             return f"answers pings, but its model number cannot be read: {remedy}"
         if (number := reply.word()) != device.model_number:
             return (
-                f"answers with model number {number}{_known(number, plan.protocol)}, and that of "
-                f"{device.model} is {device.model_number}: correct `model` or the ID"
+                f"has model number {number}{_known(number, plan.protocol)}, not {device.model_number} "
+                f"({device.model}): correct `model` or the ID"
             )
     for block in device.blocks:
         reply = yield from retry(line.read_range(device.servo_id, block.address, block.length, block.spare))
         if not reply.answered:
             end = block.address + block.length - 1
-            why = "refuses to be read" if reply.outcome is TransactionOutcome.REFUSED else "cannot be read"
-            return f"{why} at the addresses {block.address} to {end}: is it a {device.model}?"
+            why = "rejects reads" if reply.outcome is TransactionOutcome.REFUSED else "cannot be read"
+            return f"{why} at addresses {block.address} to {end}: is it a {device.model}?"
     return ""
 
 
 def _known(number: int, protocol: float) -> str:
     models = [table.model for table in models_by_number(number, protocol)]
     models += [table.model for table in devices_by_number(number, protocol)]
-    return f", which is that of {models[0]}" if models else ""
+    return f" ({models[0]})" if models else ""

@@ -22,9 +22,7 @@ def _items(value: object) -> tuple[tuple[str, str], ...]:
     elif isinstance(value, dict) and value:
         pairs = [*value.items()]
     else:
-        raise validation_error(
-            "this names no item of the device's table", "write a list of items, or NAME: ITEM for each"
-        )
+        raise validation_error("this is not a list of items", "write a list of items, or NAME: ITEM for each")
     for name, item in pairs:
         if not isinstance(item, str) or not _ITEM.fullmatch(item):
             raise validation_error(
@@ -36,7 +34,7 @@ def _items(value: object) -> tuple[tuple[str, str], ...]:
                 "start with a letter, and use letters, digits and _, such as angular_velocity.x",
             )
         if name == "age":
-            raise validation_error("every device has an age already", "give this another name")
+            raise validation_error("the name age is reserved", "choose another name")
     items = [item for _, item in pairs]
     for item in items:
         if items.count(item) > 1:
@@ -70,14 +68,14 @@ Items = Annotated[
 
 def _numbers(value: object) -> dict[str, float]:
     if not isinstance(value, dict):
-        raise validation_error("this gives no values of states", "write STATE: NUMBER for each, in SI units")
+        raise validation_error(
+            "this is not a mapping of states to numbers", "write STATE: NUMBER for each, in SI units"
+        )
     for name, number in value.items():
         if not isinstance(name, str) or isinstance(number, bool) or not isinstance(number, int | float):
-            raise validation_error(f"{number!r} is not a value of a state", "write a number, in SI units")
+            raise validation_error(f"{number!r} is not a number", "write a number in SI units")
         if not math.isfinite(number):
-            raise validation_error(
-                f"{number!r} is not a value of a state", "write a finite number, in SI units"
-            )
+            raise validation_error(f"{number!r} is not finite", "write a finite number in SI units")
     return {name: float(number) for name, number in value.items()}
 
 
@@ -109,9 +107,7 @@ class Device(Form):
     """Form of one device on a bus, such as an IMU, a foot with pressure sensors, or a power board."""
 
     bus: str = key("Name of the device's bus.", "main")
-    id: int = key(
-        "ID of the device, which no servo or other device of the bus may have.", "241", ge=0, le=253
-    )
+    id: int = key("ID of the device, unique among the servos and devices of the bus.", "241", ge=0, le=253)
     model: str = Field(
         min_length=1,
         description="Model of the device (see `dxlrun models`), or the TOML file of its control table.",
@@ -125,8 +121,8 @@ class Device(Form):
     )
     commands: Items = key("Items that controllers may command, as a list or as NAME: ITEM.", "[led]", ())
     safe: Numbers = key(
-        "Values of commands, SI units, when their controller stops and at the end of the run; the "
-        "safe values in the control table by default.",
+        "Values of commands, SI units, for a stopped controller and for the end of the run; by default "
+        "the safe values in the control table.",
         "{led: 0}",
         {},
     )

@@ -156,7 +156,7 @@ class Devices:
             reply = yield replace(request, timeout_ns=brief_ns)
             if not reply.answered:
                 problem = (
-                    "refuses to be read" if reply.outcome is TransactionOutcome.REFUSED else "does not answer"
+                    "rejects reads" if reply.outcome is TransactionOutcome.REFUSED else "does not answer"
                 )
                 break
         if not problem and loss.reported:  # the device may have been replaced

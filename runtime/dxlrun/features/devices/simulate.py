@@ -35,14 +35,14 @@ def simulated_states(
             if state not in read:
                 file.error(mark, f"{name} has no state {state}", suggestion(state, tuple(read)))
             elif key == "noise" and number < 0:
-                file.error(mark, f"the noise of {state} is below 0", "write a standard deviation")
+                file.error(mark, f"the noise of {state} is negative", "write a standard deviation")
     if keys.link and (links is None or keys.link not in links):
         mark = file.at("devices", name, "simulation", "link")
         if links is None:
-            what = f"{name} is on link {keys.link}, and the file names no URDF"
+            what = f"{name} is on link {keys.link}, but the robot file has no URDF"
             file.error(mark, what, "write `model: {urdf: ...}`, or remove link")
         else:
-            what = f"{name} is on link {keys.link}, which the URDF does not have"
+            what = f"link {keys.link} of {name} is not in the URDF"
             file.error(mark, what, suggestion(keys.link, tuple(links)))
     return DeviceReadings(
         states={item.name: state for state, item in read.items()},

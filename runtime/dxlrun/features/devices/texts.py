@@ -12,7 +12,7 @@ def device_found(model: str, device_id: int, bus: str) -> str:
 
 @event_text(EventCode.SETUP, Severity.WARNING)
 def device_read_apart(device: str) -> str:
-    return f"{device} answers single reads, but no reads together with others; it is read alone from now on"
+    return f"{device} does not answer combined reads; it is read alone from now on"
 
 
 @event_text(EventCode.READ_LOST, Severity.WARNING)

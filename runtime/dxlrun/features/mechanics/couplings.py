@@ -118,14 +118,14 @@ def _check_joints(file: RobotFile, name: str, transmission: Transmission, owners
         mark = file.at("transmissions", name, "joints", index)
         entry, owner = robot.joints.get(joint), owners.setdefault(joint, name)
         if entry is None:
-            what = f"transmission {name} moves joint {joint}, which is not defined"
+            what = f"joint {joint} of transmission {name} is not defined"
             file.error(mark, what, suggestion(joint, tuple(robot.joints)))
         elif owner != name or joint in transmission.joints[:index]:
             what = f"{joint} is moved by transmission {owner} already"
-            file.error(mark, what, "name each joint in one transmission, once")
+            file.error(mark, what, "name each joint only once")
         elif isinstance(entry, ServoJoint):
-            what = f"{joint} has a servo of its own, and is moved by transmission {name}"
-            file.error(mark, what, f"take bus, id and the other keys of a servo out of {joint}")
+            what = f"{joint} has its own servo, but transmission {name} moves it"
+            file.error(mark, what, f"remove bus, id and the other servo keys from {joint}")
         else:
             continue
         good = False
@@ -134,7 +134,7 @@ def _check_joints(file: RobotFile, name: str, transmission: Transmission, owners
     if name in robot.joints:
         file.error(
             file.key("transmissions", name),
-            f"{name} is the name of a joint already, and both name servos",
+            f"{name} is already the name of a joint",
             "give the transmission another name",
         )
         good = False
@@ -144,9 +144,8 @@ def _check_joints(file: RobotFile, name: str, transmission: Transmission, owners
             one = next(j for j, entry in zip(transmission.joints, entries, strict=True) if _set(entry, key))
             file.error(
                 file.at("joints", one, key),
-                f"{key} of {one} differs from that of the other joints of transmission {name}; its "
-                "servos move them together",
-                f"write {key} alike for {', '.join(transmission.joints)}",
+                f"{key} of {one} differs from the other joints of transmission {name}",
+                f"write the same {key} for {', '.join(transmission.joints)}",
             )
             good = False
     return good
@@ -178,28 +177,28 @@ def _matrix(file: RobotFile, name: str, transmission: Transmission) -> tuple[Row
         file.error(place, f"{name} has no matrix", "add `matrix: [[0.5, 0.5], [0.5, -0.5]]`")
         return None
     if named is not None and transmission.matrix is not None:
-        what = f"{name} is a {transmission.type}, whose matrix is known"
+        what = f"{name} is a {transmission.type} and has a fixed matrix"
         file.error(file.key("transmissions", name, "matrix"), what, "remove matrix, or write `type: matrix`")
         return None
     if named is not None and (servos, joints) != (len(named[0]), len(named)):
         what = f"{name} is a {transmission.type} with {servos} servos and {joints} joints"
-        file.error(place, what, "give it two of each, or write `type: matrix`")
+        file.error(place, what, "give it two servos and two joints, or write `type: matrix`")
         return None
     widths = {len(row) for row in matrix}
     if len(matrix) != joints or widths != {servos}:
         shape = f"{len(matrix)} x {widths.pop()}" if len(widths) == 1 else f"{len(matrix)} uneven rows"
         file.error(
             mark,
-            f"the matrix of {name} has {shape}, but its {joints} joints and {servos} servos ask for "
+            f"the matrix of {name} has {shape}, but its {joints} joints and {servos} servos need "
             f"{joints} x {servos}",
-            "write a row for each joint, and in it a number for each servo",
+            "write one row per joint, with one number per servo",
         )
         return None
     if servos < joints:
         file.error(
             mark,
             f"{name} moves {joints} joints with {servos} servos",
-            "a joint needs a servo at least; add one",
+            "add servos; each joint needs at least one",
         )
         return None
     return _inverted(name, matrix, mark, file)
@@ -215,15 +214,15 @@ def _inverted(name: str, matrix: Rows, mark: Mark, problems: Problems) -> tuple[
     if wrong.size:
         problems.error(
             mark,
-            f"the matrix of {name} moves a joint by {float(wrong[0]):.3g} rad for a rad of a servo",
-            f"write what its gears do, {1 / MOST_RATIO:g} to {1 / LEAST_RATIO:g} for each joint",
+            f"the matrix of {name} moves a joint by {float(wrong[0]):.3g} rad per rad of a servo",
+            f"correct it; the largest number of a row is {1 / MOST_RATIO:g} to {1 / LEAST_RATIO:g}",
         )
         return None
     singular = np.linalg.svd(values, compute_uv=False)
     if singular[-1] <= 1e-9 * singular[0]:
         problems.error(
             mark,
-            f"the matrix of {name} is singular: no motion of its servos moves one of its joints alone",
+            f"the matrix of {name} is singular: its servos cannot move each joint alone",
             "correct it; its rows must not be multiples or sums of each other",
         )
         return None
@@ -231,9 +230,9 @@ def _inverted(name: str, matrix: Rows, mark: Mark, problems: Problems) -> tuple[
     if condition > MOST_CONDITION:
         problems.error(
             mark,
-            f"the matrix of {name} is nearly singular (condition number {condition:.3g}): a step of a servo "
-            "is a jump of a joint",
-            f"check its numbers and their unit, rad per rad; {MOST_CONDITION:g} is the most",
+            f"the matrix of {name} is nearly singular (condition number {condition:.3g}): a small "
+            "servo step moves a joint far",
+            f"check its numbers and unit, rad per rad; the condition number is at most {MOST_CONDITION:g}",
         )
         return None
     inverse = np.linalg.pinv(values) if values.shape[0] != values.shape[1] else np.linalg.inv(values)
@@ -254,15 +253,15 @@ def _agree(file: RobotFile, coupling: Coupling) -> bool:
         model = other.described.mark(marks, "model")
         if one is not None and two is not None and one.protocol != two.protocol:
             what = f"{pair} one speaks Protocol {one.protocol}, the other {two.protocol}"
-            file.error(mark, what, "put both on buses of one protocol")
+            file.error(mark, what, "put both on buses with the same protocol")
             good = False
         elif one is not None and two is not None and one.baud_rate != two.baud_rate:
             what = f"{pair} one bus runs at {one.baud_rate} baud, the other at {two.baud_rate}"
-            file.error(mark, what, "put both on one bus, or let both buses run at one baud rate")
+            file.error(mark, what, "put both on one bus, or use the same baud rate for both buses")
             good = False
         elif first.table.effort_unit != other.table.effort_unit:
             what = f"{pair} one measures its load, the other its current or torque"
-            file.error(model, what, "use two of the same model")
+            file.error(model, what, "use two servos of the same model")
             good = False
         else:
             speeds = sorted((first.top_speed, other.top_speed))
@@ -271,8 +270,7 @@ def _agree(file: RobotFile, coupling: Coupling) -> bool:
                     model,
                     f"{pair} {first.table.model} and {other.table.model} differ in their top speeds, "
                     f"{speeds[0]:.3g} and {speeds[1]:.3g} rad/s",
-                    "the slower one limits the speed, and the other pulls against it; use two of the same "
-                    "model",
+                    "use two servos of the same model; the slower one limits the speed",
                 )
     if good and not coupling.modes:
         file.error(
@@ -301,9 +299,9 @@ def allowed_limits(file: RobotFile, coupling: Coupling) -> tuple[Interval | None
         if reach is None:
             file.error(
                 file.at("joints", name, "servos"),
-                f"the servos of {name} have no angle of the joint in common: one reaches "
+                f"the servos of {name} share no joint angle: one reaches "
                 f"{coupling.servos[0].position_range}, another {coupling.servos[-1].position_range}",
-                "check the reference and direction of each",
+                "check reference and direction of each servo",
             )
             return (None,)
         return (_allowed(file, name, joints[name], reach, coupling.servos[0].table.model),)
@@ -325,14 +323,14 @@ def _allowed(file: RobotFile, name: str, joint: JointEntry, reach: Interval, mod
     if allowed is None:
         file.error(
             mark,
-            f"limits {written} of {name} have nothing in common with the reach of its {model}, {reach}",
+            f"limits {written} of {name} are outside the reach of its {model}, {reach}",
             "check limits, reference and direction",
         )
     elif not reach.contains(written):
         file.warning(
             mark,
-            f"limits {written} of {name} go beyond the reach of its {model}, {reach}",
-            f"the joint will keep {allowed}; write that, or check reference and direction",
+            f"limits {written} of {name} exceed the reach of its {model}, {reach}",
+            f"write the effective limits {allowed}, or check reference and direction",
         )
     return allowed
 
@@ -396,8 +394,8 @@ def box(
     if free and share < _LEAST_SHARE:
         file.error(
             file.key("joints", free[0]),
-            f"the limits of the other joints of transmission {coupling.name} leave nothing for {free[0]}",
-            f"write `limits: {{position: ...}}` for {free[0]}, or make the others narrower",
+            f"the limits of the other joints of transmission {coupling.name} leave no range for {free[0]}",
+            f"write `limits: {{position: ...}}` for {free[0]}, or narrow the other limits",
         )
         return None
     return tuple(
@@ -432,9 +430,9 @@ def _fits(
         lower, higher = sorted(theta(servo, each) for each in (reach.lower, reach.upper))
         file.error(
             file.at("joints", joint, "limits", "position"),
-            f"with {corner} servo {servo.described.title} (ID {servo.described.id}) would have to be at "
-            f"{degrees(theta(servo, end))} deg, but it goes from {degrees(lower)} to {degrees(higher)} deg",
-            f"make the limits of {' and '.join(coupling.joints)} narrower, so that all corners are reached",
+            f"with {corner}, servo {servo.described.title} (ID {servo.described.id}) must be at "
+            f"{degrees(theta(servo, end))} deg, but reaches {degrees(lower)} to {degrees(higher)} deg",
+            f"narrow the limits of {' and '.join(coupling.joints)}",
         )
         good = False
     return good
@@ -513,9 +511,9 @@ def check_together(file: RobotFile, coupling: Coupling) -> None:
             if own is not None and needed > own * (1 + 1e-9):
                 file.warning(
                     file.at("joints", coupling.joints[0], "limits", which),
-                    f"with {' and '.join(coupling.joints)} at their {which} limits servo "
-                    f"{servo.described.title} (ID {servo.described.id}) would need {needed:.4g} {unit}, and "
+                    f"with {' and '.join(coupling.joints)} at their {which} limits, servo "
+                    f"{servo.described.title} (ID {servo.described.id}) needs {needed:.4g} {unit}, but "
                     f"has {own:.4g} {unit}".rstrip(),
-                    f"together they get less; lower the {which} limits",
+                    f"lower the {which} limits",
                 )
                 break

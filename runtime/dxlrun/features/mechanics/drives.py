@@ -51,7 +51,7 @@ def compile_drives(file: RobotFile, servos: Mapping[str, CompiledServo]) -> dict
 
 
 def _excluded(coupling: Coupling) -> dict[Mode, str]:
-    reason = f"the servos of transmission {coupling.name} are not moved together by it"
+    reason = f"transmission {coupling.name} does not coordinate its servos in this mode"
     return {Mode.PWM: reason} if coupling.transmission else {}
 
 

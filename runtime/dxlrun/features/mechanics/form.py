@@ -45,8 +45,8 @@ class Transmission(Form):
     """Form of one transmission: its joints, its servos, and the matrix from servo to joint positions."""
 
     type: Literal["differential", "matrix"] = key(
-        "Kind of transmission: half of the sum and half of the difference of two servos "
-        "(differential), or the given `matrix`.",
+        "Kind of transmission: differential (half of the sum and half of the difference of two servos) "
+        "or matrix (see `matrix`).",
         "differential",
     )
     joints: Annotated[tuple[Name, ...], Field(strict=False, min_length=1)] = key(
@@ -67,7 +67,7 @@ class Transmission(Form):
         None,
     )
     tolerance: Tolerance | None = key(
-        "Largest disagreement of the servos if there are more servos than joints; 3 deg by default.",
+        "Largest disagreement of the servos if they outnumber the joints; 3 deg by default.",
         "3 deg",
         None,
     )

@@ -95,8 +95,8 @@ class CouplingCheck:
         coupling = self._plan.couplings[index]
         if self._spread(index, coupling) > coupling.tolerance > 0:
             return [
-                f"{self._disagreement(index, coupling)}: check the reference and direction of each, and "
-                "what couples them"
+                f"{self._disagreement(index, coupling)}: check reference and direction of each servo, and "
+                "the mechanism between them"
             ]
         problems: list[str] = []
         for row in coupling.joints:
@@ -159,8 +159,8 @@ class CouplingCheck:
         spread = servo.position_text(self._spread(index, coupling))
         return (
             f"the servos of {coupling.name} disagree by {spread}, "
-            f"more than its tolerance of {servo.position_text(coupling.tolerance)}: {self._labels[high]} has "
-            f"it at {servo.position_text(float(position[high]))}, {self._labels[low]} at "
+            f"more than its tolerance of {servo.position_text(coupling.tolerance)}: {self._labels[high]} "
+            f"reports {servo.position_text(float(position[high]))}, {self._labels[low]} reports "
             f"{servo.position_text(float(position[low]))}"
         )
 
@@ -353,7 +353,7 @@ class JointHardware(HardwareLayer):
             values = [found[one][1] for one in servos]
             if alike and not problems and len(set(values)) > 1:
                 each = ", ".join(f"{self._together.label(one)} has {found[one][1]}" for one in servos)
-                problems.append(f"its servos differ: {each}")
+                problems.append(f"its servos have different values: {each}")
             done("; ".join(problems), values[0])
 
         for servo in servos:

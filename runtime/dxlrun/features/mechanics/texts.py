@@ -15,8 +15,8 @@ def torque_refused(coupling: str, problem: str) -> str:
 @event_text(EventCode.TORQUE_OFF, Severity.WARNING)
 def partners_released(coupling: str, limp: Sequence[str], others: Sequence[str]) -> str:
     return (
-        f"{coupling}: {' and '.join(limp)} is limp, so torque goes off on {' and '.join(others)}: "
-        "they move one mechanism"
+        f"{coupling}: torque is switched off on {' and '.join(others)}, as {' and '.join(limp)} of the same "
+        "mechanism is limp"
     )
 
 

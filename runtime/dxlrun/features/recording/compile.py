@@ -18,15 +18,15 @@ def compile_recording(compilation: Compilation) -> Contribution:
     if amount.get("bytes", _LEAST_BYTES) < _LEAST_BYTES or amount.get("ns", _LEAST_NS) < _LEAST_NS:
         file.error(
             marks.value("recording", "split"),
-            "parts of a log would be too small: each has the robot file and the plan inside",
-            "write 1 MB or 1 s at least",
+            "the files of a log would be too small: each contains the robot file and the plan",
+            "write at least 1 MB or 1 s",
         )
     kept = {} if written.keep is None else dict([written.keep])
     if "ns" in kept and written.split is None:
         file.error(
             marks.key("recording", "keep"),
-            "keep needs parts: a log in one file is kept whole",
-            "add `split: 1 min`, or a size, or remove keep",
+            "a duration under keep needs split",
+            "add `split: 1 min`, or write a size under keep",
         )
     limits = amount.get("bytes"), amount.get("ns"), kept.get("ns"), kept.get("bytes")
     return Contribution(recording=RecordingPlan(written.directory, *limits))

@@ -14,7 +14,7 @@ class Recording(Form):
         "Directory of the logs, relative to the working directory.", "logs", "logs", min_length=1
     )
     split: SizeOrDuration | None = key(
-        "Size or duration after which a log continues in another file, at least 1 MB or 1 s.", "100 MB", None
+        "Size or duration after which a log continues in a new file, at least 1 MB or 1 s.", "100 MB", None
     )
     keep: SizeOrDuration | None = key(
         "Limit for old data. Beyond a size, the oldest logs in the directory are deleted at the end "

@@ -14,7 +14,8 @@ from dxlrun.features.feature import ServoKey
 def _register(value: object) -> object:
     if isinstance(value, bool) or not isinstance(value, int | str):
         raise validation_error(
-            "this is not a value of a register", "write the raw integer, or a quantity with its unit: 500 us"
+            "this is not a register value",
+            "write the raw integer, or a quantity with its unit, such as 500 us",
         )
     return value
 
@@ -31,7 +32,7 @@ STAGE: ServoKey[Mapping[str, Register]] = ServoKey(
         {},
     ),
     of_one=key(
-        "Values of items in the servo's control table; the joint's by default.",
+        "Values of items in the servo's control table; by default those of the joint.",
         "{position_p_gain: 800}",
         None,
     ),

@@ -23,8 +23,8 @@ _LOWER = ("min_position_limit", "cw_angle_limit")
 _UPPER = ("max_position_limit", "ccw_angle_limit")
 _COMMANDED = ("controllers command it", "remove it; a controller sends it")
 _MODE = ("the interfaces of the active controllers choose the mode", "remove it; claim other interfaces")
-_ADDRESS = ("dxlrun finds the servo by it", "remove it; `dxlrun servo` changes it")
-_SECOND_ID = ("a servo with a second ID executes the goals of another one", "remove it")
+_ADDRESS = ("dxlrun finds the servo by it", "remove it; use `dxlrun servo` instead")
+_SECOND_ID = ("a servo with a second ID executes the goals of another servo", "remove it")
 _TICK = ("it changes the size of a tick", "remove it")
 _OWN: Mapping[str, tuple[str, str]] = MappingProxyType(
     {
@@ -50,7 +50,7 @@ _OWN: Mapping[str, tuple[str, str]] = MappingProxyType(
             "policies reduce it, and a start restores it",
             "declare max_torque, its value after power-on",
         ),
-        "bus_watchdog": ("dxlrun arms it", "remove it; the key `bus_watchdog` of the bus sets its time"),
+        "bus_watchdog": ("dxlrun arms it", "remove it; write `bus_watchdog` at the bus"),
         "lock": ("it closes the EEPROM until power-off", "remove it"),
         "hybrid_save": ("it stores RAM values in the EEPROM", "remove it"),
         "electronic_gearratio_numerator": _TICK,
@@ -105,7 +105,7 @@ def check_position_limits(file: RobotFile, plan: BusPlan) -> None:
             file.error(
                 _place(file.description, servo, register.name),
                 f"{servo.joint} declares {register.name} = {register.value}, but its limits reach to tick "
-                f"{needed}, and the servo would refuse goals there",
+                f"{needed}",
                 f"declare {needed}, or make `limits: {{position: ...}}` narrower",
             )
 
@@ -139,7 +139,7 @@ def register_value(table: ControlTable, name: str, value: int | str) -> Register
     """
     item = table.items.get(name)
     if item is None:
-        raise UnfitRegister(f"an {table.model} has no register {name}", suggestion(name, declarable(table)))
+        raise UnfitRegister(f"{table.model} has no register {name}", suggestion(name, declarable(table)))
     if reason := own_reason(table, item):
         raise UnfitRegister(f"{item.title} cannot be declared: {reason[0]}", reason[1])
     found = any_value(table, name, value)
@@ -161,8 +161,8 @@ def check_change(table: ControlTable, name: str, value: int | str) -> RegisterVa
     item = table.items[name]
     if found.eeprom:
         raise UnfitRegister(
-            f"{item.title} is in the EEPROM, which cannot be written while the servo has torque",
-            "declare it under `registers` in the robot file, which the next start writes",
+            f"{item.title} is in the EEPROM, not writable while the servo has torque",
+            "declare it under `registers` in the robot file; the next start writes it",
         )
     if item.deviation is not None and item.deviation.may_refuse:
         raise UnfitRegister(
@@ -183,7 +183,7 @@ def own_reason(table: ControlTable, item: ControlItem) -> tuple[str, str] | None
         return "a reboot resets it", "remove it"
     if item.name in _ANGLE_LIMITS and table.protocol == 1.0:
         return (
-            "both angle limits choose the mode, which dxlrun sets",
+            "dxlrun sets the mode with both angle limits",
             "write `limits: {position: ...}` instead",
         )
     rule = item.deviation
@@ -198,7 +198,7 @@ def _check_meaning(item: ControlItem, raw: int) -> None:
     if rule is None or rule.planned or factory is None or rule.judge_value(raw, factory) != "refuse":
         return
     raise UnfitRegister(
-        f"{item.title} cannot be {raw}, which {rule.effect_of(raw)}", f"write {factory}, or remove it"
+        f"{item.title} cannot be {raw}: this value {rule.effect_of(raw)}", f"write {factory}, or remove it"
     )
 
 

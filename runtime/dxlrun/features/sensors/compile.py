@@ -72,7 +72,7 @@ def _compiled(
             marks.value("sensors", name, "timeout"),
             f"{name} delivers a sample every {period_ns / 1e6:g} ms, but counts as lost after "
             f"{entry.timeout / 1e6:g} ms without one",
-            "write a longer timeout, such as five periods, or the rate that it has",
+            "write a longer timeout, such as five periods, or the correct rate",
         )
     return plan
 
@@ -128,7 +128,7 @@ def _check_links(
     if robot.model is None:
         file.error(
             mark,
-            f"{name} senses the motion of link {', '.join(links)}, and the file names no URDF",
+            f"{name} senses the motion of link {', '.join(links)}, but the robot file has no URDF",
             "write `model: {urdf: ...}`",
         )
     real = [bus for bus, each in robot.buses.items() if each.port != SIMULATED]
@@ -136,13 +136,13 @@ def _check_links(
         file.error(
             mark,
             f"{name} senses the simulated body, but bus {', '.join(real)} has a real port",
-            "give a sensor of the robot by an argument of the file, such as type: ${imu}, or take port:=sim",
+            "choose a real sensor, such as `type: ${imu}` with an argument, or use port:=sim",
         )
     for link in links:
         if known is not None and link not in known:
             file.error(
                 _text_mark(file, name, entry, link),
-                f"{name} is on link {link}, which the URDF does not have",
+                f"link {link} of {name} is not in the URDF",
                 suggestion(link, tuple(known)),
             )
 

@@ -25,7 +25,7 @@ class SensorEntry(PlugInEntry):
         None,
     )
     on_lost: Literal["continue", "stop"] = key(
-        "Reaction to samples older than `timeout`: continue, or end the run by the policy on_fault (stop).",
+        "Reaction to samples older than `timeout`: continue, or end the run by on_fault (stop).",
         "stop",
         "continue",
     )

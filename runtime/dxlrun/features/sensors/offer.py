@@ -17,14 +17,14 @@ _METHODS = ("__init__", "states", "units", "links", "noisy", "open", "read", "cl
 def sensor_breach(sensor: object) -> Breach | None:
     """Return how an object breaks the contract of a sensor class, with the fix; None if it does not."""
     if not is_model(sensor, Sensor):
-        return "which is not a sensor", "derive a class from dxlrun.Sensor"
+        return "it is not a sensor", "derive it from dxlrun.Sensor"
     if breach := methods_breach(sensor, Sensor, _METHODS):
         return breach
     if not is_model(getattr(sensor, "Parameters", None), ParametersModel):
-        return "whose Parameters is not a model of parameters", "derive it from dxlrun.ParametersModel"
+        return "its Parameters is not a parameters model", "derive it from dxlrun.ParametersModel"
     for flag in ("waits", "simulated"):
         if not isinstance(getattr(sensor, flag), bool):
-            return f"whose {flag} is neither True nor False", "write one of them"
+            return f"its {flag} is neither True nor False", "set it to True or False"
     return None
 
 
@@ -39,10 +39,10 @@ def names_breach(states: object, links: object) -> Breach | None:
     if wrong := [one for one in found if not one or "/" in one or one == "age"]:
         return (
             f"has a state {wrong[0]!r}",
-            "name a state as angular_velocity.x; each source has an age already",
+            "choose a name such as angular_velocity.x; age is reserved",
         )
     if len(set(found)) < len(found):
-        return f"has a state twice: {', '.join(found)}", "name each once"
+        return f"has a state twice: {', '.join(found)}", "name each state once"
     return None
 
 

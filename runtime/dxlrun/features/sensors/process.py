@@ -62,8 +62,8 @@ def refuse_virtual_time(plan: bytes) -> str:
     measuring = [sensor for sensor in decode_sensors(plan) if not sensor.simulated]
     names = ", ".join(f"{sensor.name} ({sensor.type})" for sensor in measuring)
     return names and (
-        f"virtual time needs simulated sensors, but {names} measures the real world: "
-        "omit --virtual, or remove the sensor and what reads it from this file"
+        f"virtual time needs simulated sensors, but {names} is real: "
+        "omit --virtual, or remove the sensor and its readers from the robot file"
     )
 
 
