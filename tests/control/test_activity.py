@@ -73,7 +73,7 @@ def test_what_a_controller_starts_while_the_robot_runs_is_refused_and_its_fault(
     robot.script("odd", act).send(40_000_000, "odd", "go", 1.0)
     result = robot.run(5)
     assert result.reason == "fault"
-    assert result.detail.startswith(f"controller odd tried to start {what} in {CALLS[at]}: while the robot")
+    assert result.detail.startswith(f"controller odd tried to start {what} in {CALLS[at]}; this would stop")
     ((_, fault),) = robot.events.of(EventCode.CONTROLLER_FAULT)
     assert fault.startswith(result.detail)
     assert ("Traceback" in fault) == (start is not swallowed)
@@ -112,7 +112,7 @@ def test_processes_are_for_on_configure_and_threads_of_others_are_theirs(robot):
     assert (result.reason, result.detail) == ("stopped", "")
 
 
-NEVER = "in update: while the robot runs that would stop the loop; start a process in on_configure instead"
+NEVER = "in update; this would stop the running loop: start a process in on_configure instead"
 
 
 def breach(activity, call, method=ControllerMethod.UPDATE):

@@ -292,7 +292,7 @@ def test_fallback_of_a_limp_joint_leaves_the_fault_to_the_next_fallback_or_to_th
         story.record.states.torque[story.names.index(joint)] = Torque.OFF
     story.run(8, {3: story.breaks("lower")})
     refused = [text.split(";")[0] for text in story.events.texts(EventCode.COMMAND_REFUSED)]
-    both = ["near does not take over: j0 is limp", "far does not take over: j1 is limp"]
+    both = ["near cannot take over: j0 is limp", "far cannot take over: j1 is limp"]
     assert refused == both[: len(limp)]
     story.ends(*(["far"] if len(limp) == 1 else []), reason="ended" if len(limp) == 1 else "fault")
 
@@ -305,7 +305,10 @@ def test_a_lower_end_that_fails_to_activate_keeps_the_upper_one_out(story):
     story.ends("still")
     code, fields = story.answer()
     assert (code, fields["controller"]) == (Code.CONTROLLER_FAULT, "lower")
-    assert "upper is not activated: lower" in story.events.texts(EventCode.COMMAND_REFUSED)[0]
+    assert (
+        "upper is not activated: its lower controller lower"
+        in story.events.texts(EventCode.COMMAND_REFUSED)[0]
+    )
 
 
 def test_an_upper_end_that_fails_to_activate_leaves_the_lower_one_holding(story):
@@ -483,7 +486,7 @@ def test_a_controller_that_is_loaded_may_command_references(story):
         (
             UPPER | EFFORT,
             Code.CONTROLLER_FAULT,
-            {"problem": "controller extra commands j0/effort, which none of lower exports"},
+            {"problem": "controller extra commands j0/effort, but none of lower exports it"},
         ),
         (UPPER | {"reads": ("lower/j0/position", "upper/j0/position")}, Code.CONTROLLER_FAULT, {}),
     ],

@@ -202,11 +202,11 @@ def test_a_command_of_a_device_beyond_its_range_is_held_at_the_end_and_told_once
     assert rig.texts == []
     assert lit(3.0, -7.0) == [1.0, -2.0]
     expected = [
-        "light (ID 102 on bus main): lamp = 3 is held to its range 0..1",
-        "light (ID 102 on bus main): level = -7 is held to its range -2..2.5",
+        "light (ID 102 on bus main): lamp = 3 is clamped to its range 0..1",
+        "light (ID 102 on bus main): level = -7 is clamped to its range -2..2.5",
     ]
     assert rig.texts == expected
     lit(4.0, 2.0)
     rig.apply()  # nothing was commanded anew
     lit(5.0, 9.0)
-    assert rig.texts == [*expected, "light (ID 102 on bus main): level = 9 is held to its range -2..2.5"]
+    assert rig.texts == [*expected, "light (ID 102 on bus main): level = 9 is clamped to its range -2..2.5"]

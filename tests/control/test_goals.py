@@ -177,7 +177,7 @@ def test_each_goal_takes_the_place_of_the_one_before(story):
     ends = ["preempted"] * 3 + ["aborted"]
     expected = [one for number, end in enumerate(ends, 1) for one in ((number, "accepted"), (number, end))]
     assert story.statuses == expected
-    assert story.reports[1][1].text == "goal 2 took its place"
+    assert story.reports[1][1].text == "replaced by goal 2"
 
 
 @pytest.mark.parametrize("which", [{"goal": 1}, {"controller": "arm"}])
@@ -405,7 +405,7 @@ def test_changed_parameters_survive_a_switch_in_the_same_cycle_and_later_ones(st
         ({"speed": 2.0, "gains.q": 1.0}, "arm: gains.q is not a live parameter"),
         ({"speed": 2.0, "gains.d": 1.0}, "arm: gains.d is not a live parameter"),
         ({"gains": 1.0}, "arm: gains is not a live parameter"),
-        ({"speed": "fast"}, "the data of parameters do not fit"),
+        ({"speed": "fast"}, "wrong data for parameters: "),
     ],
 )
 def test_parameters_that_are_not_live_are_refused_whole(story, values, text):
@@ -433,11 +433,11 @@ def test_a_controller_that_raises_in_on_parameters_breaks_its_contract(active):
 @pytest.mark.parametrize(
     ("changed", "what"),
     [
-        ({"Goals": frozenset({3})}, "whose Goals is of a wrong type"),
-        ({"on_goal": Controller.on_goal}, "which has Goals and no method on_goal"),
-        ({"on_goal": lambda self, goal: None}, "whose on_goal(goal) cannot be called as"),
-        ({"on_cancel": lambda self: None}, "whose on_cancel() cannot be called as"),
-        ({"on_parameters": lambda self: None}, "whose on_parameters() cannot be called as"),
+        ({"Goals": frozenset({3})}, "its Goals has the wrong type"),
+        ({"on_goal": Controller.on_goal}, "it has Goals, but no method on_goal"),
+        ({"on_goal": lambda self, goal: None}, "its on_goal(goal) cannot be called as"),
+        ({"on_cancel": lambda self: None}, "its on_cancel() cannot be called as"),
+        ({"on_parameters": lambda self: None}, "its on_parameters() cannot be called as"),
     ],
 )
 def test_a_wrong_declaration_is_refused_when_the_plug_in_is_loaded(changed, what):
@@ -489,10 +489,10 @@ def test_the_parts_of_a_motion_begin_in_one_cycle_and_are_goals(story):
 @pytest.mark.parametrize(
     ("asked", "velocity", "status", "why"),
     [
-        (0.25, 0.0, "reached", "all commands were given"),
-        (0.30, 0.0, "reached", "all commands were given"),
-        (0.45, 0.0, "missed", "joint j1 is 11.46 deg off; all commands were given"),
-        (0.25, 4.38, "missed", "joint j1 still moves at 250.96 deg/s; all commands were given"),
+        (0.25, 0.0, "reached", "all commands were sent"),
+        (0.30, 0.0, "reached", "all commands were sent"),
+        (0.45, 0.0, "missed", "joint j1 is 11.46 deg off; all commands were sent"),
+        (0.25, 4.38, "missed", "joint j1 still moves at 250.96 deg/s; all commands were sent"),
     ],
 )
 def test_the_last_positions_of_a_played_motion_are_its_goal(story, asked, velocity, status, why):
@@ -612,7 +612,7 @@ def test_a_played_motion_of_a_limp_joint_is_aborted(story):
     story.run(12, {2: plays(story, LEG, ARM), 4: story.torque(Torque.OFF, row=1)})
     ended = {one.controller: (one.status, one.text) for _, one in story.reports}
     limp = "joint j1 is limp: it was reset, its torque was cut, or it shut itself down"
-    assert ended["leg"] == ("aborted", f"{limp}; all commands were given")
+    assert ended["leg"] == ("aborted", f"{limp}; all commands were sent")
     assert ended["arm"][0] == "reached"
 
 

@@ -100,7 +100,7 @@ def test_the_upper_ends_of_chains_are_released_too():
     assert story.column("active") == [3, 3, 0, 0, 0]
 
 
-LIMP = {"joint": ("j2",), "servo": ("j2",), "hint": "`dxlrun torque on j2` gives it torque"}
+LIMP = {"joint": ("j2",), "servo": ("j2",), "hint": "switch torque on with `dxlrun torque on j2`"}
 
 
 @pytest.mark.parametrize("torque", [Torque.ON, Torque.RELEASED, Torque.OFF])
@@ -110,7 +110,7 @@ def test_a_controller_is_not_activated_on_a_limp_joint(story, torque):
     at_once = torque is Torque.ON
     story.run(5, {1: [off, switch]} if at_once else {1: story.shows(2, torque=torque), 2: switch})
     assert story.answer(1 + at_once) == (Code.JOINT_LIMP, LIMP)
-    assert story.refusals[1 + at_once] == "j2 is limp; `dxlrun torque on j2` gives it torque"
+    assert story.refusals[1 + at_once] == "j2 is limp; switch torque on with `dxlrun torque on j2`"
 
 
 def test_a_limp_joint_outside_its_limits_is_moved_inside_before_it_can_get_torque(story):
@@ -119,7 +119,7 @@ def test_a_limp_joint_outside_its_limits_is_moved_inside_before_it_can_get_torqu
 
     limp = story.shows(2, torque=Torque.OFF)
     story.run(5, {1: [limp, stand_outside, story.switches(["other"])]})
-    hint = "move j2 inside the limits by hand, then `dxlrun torque on j2` gives it torque"
+    hint = "move j2 inside the limits by hand, then switch torque on with `dxlrun torque on j2`"
     assert story.answer() == (Code.JOINT_LIMP, {**LIMP, "hint": hint})
 
 
@@ -164,7 +164,7 @@ def test_what_cannot_be_is_refused_for_all_joints(story, kind, data, shown, code
 
 
 def test_what_went_wrong_with_one_of_several_is_the_answer(story):
-    waits, why = [], "j1 (ID 2 on bus main) did not confirm torque off; it is tried again"
+    waits, why = [], "j1 (ID 2 on bus main) did not confirm torque off; dxlrun sends it again"
 
     def answer():
         story.done(which=0)()
@@ -339,7 +339,7 @@ def test_a_fallback_does_not_take_over_a_limp_joint(story, torque):
     story.script("first", joints=("j2",), fallback="other")
     story.run(12, {1: story.shows(2, torque=torque), 3: story.breaks("first")})
     limp = torque is not Torque.ON
-    why = "other does not take over: j2 is limp; `dxlrun torque on j2` gives it torque"
+    why = "other cannot take over: j2 is limp; switch torque on with `dxlrun torque on j2`"
     assert story.events.texts(EventCode.COMMAND_REFUSED) == [why] * limp
     assert story.result.reason == ("fault" if limp else "stopped")
     assert ("first" in story.result.detail) is limp

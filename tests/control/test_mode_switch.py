@@ -59,7 +59,7 @@ def test_the_leaving_one_is_out_at_once_and_the_entering_one_waits_for_its_modes
     assert active == [["arm"]] * 2 + [[]] * 4 + [["wheels"]] * 4
     assert story.answered == [(2, Acceptance(("wheels",))), (6, Completion(6))]
     assert story.hardware.asked == [[VELOCITY, VELOCITY]]
-    assert story.events.of(EventCode.MODE) == [("wheels", "waits until its joints are in their modes")]
+    assert story.events.of(EventCode.MODE) == [("wheels", "waits for the mode changes of its joints")]
     assert story.record.goals.velocity.tolist() == [0.1, 0.1]
     assert np.isnan(story.record.goals.position).all()
 

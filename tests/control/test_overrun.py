@@ -43,9 +43,7 @@ def test_a_plug_in_without_an_answer_leaves_it_to_the_next_and_none_is_asked_in_
     silent = OverrunHook("silent", lambda *times: asked.append(times))
     assert ran(robot, "skip", silent, OverrunHook("stopper", lambda *_: "stop")) == [0, 1]
     assert len(asked) == 1
-    assert (
-        robot.result.detail == "cycle 1 ended after the next deadline, and the robot file has `overrun: stop`"
-    )
+    assert robot.result.detail == "cycle 1 ended after the next deadline (`overrun: stop` in the robot file)"
 
 
 def raises(*_):

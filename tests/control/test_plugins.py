@@ -74,33 +74,31 @@ BROKEN = {
     "cannot be imported (SyntaxError": "def",
     "cannot be imported (SystemExit: 3)": "import sys; sys.exit(3)",
     "does not declare its contract": changed("@hookimpl\ndef dxlrun_contract", "def contract"),
-    "was written for contract 5, this dxlrun has contract 4": changed("return 1", "return 5"),
-    "was written for contract 0, this dxlrun has contract 4": changed("return 1", "return 0"),
-    "was written for contract True, this dxlrun has contract 4": changed("return 1", "return True"),
-    "was written for contract '2', this dxlrun has contract 4": changed("return 1", "return '2'"),
+    "was written for contract 5, but this dxlrun has contract 4": changed("return 1", "return 5"),
+    "was written for contract 0, but this dxlrun has contract 4": changed("return 1", "return 0"),
+    "was written for contract True, but this dxlrun has contract 4": changed("return 1", "return True"),
+    "was written for contract '2', but this dxlrun has contract 4": changed("return 1", "return '2'"),
     "Argument(s) {'robot'} are declared in the hookimpl but can not be found": changed(
         "def dxlrun_controllers()", "def dxlrun_controllers(robot)"
     ),
     "unknown hook 'dxlrun_sonars'": GOOD + "\n@hookimpl\ndef dxlrun_sonars():\n    pass\n",
-    "has a function dxlrun_controllers that is not marked as a hook": changed(
+    "has an unmarked hook dxlrun_controllers": changed(
         "@hookimpl\ndef dxlrun_controllers", "def dxlrun_controllers"
     ),
     "raised in a hook (ZeroDivisionError: division by zero)": changed('{"TYPE": Mine}', "1 / 0"),
     "does not return a mapping": changed('{"TYPE": Mine}', "[Mine]"),
     "does not return a mapping of names": changed('{"TYPE": Mine}', "{5: Mine}"),
-    "offers dict as odd, which is not a controller": changed('{"TYPE": Mine}', '{"odd": dict}'),
-    "which has no method update": changed("update", "renew"),
-    "whose update(time_ns) cannot be called as update(time_ns, period_ns)": changed(
+    "offers dict as odd: it is not a controller": changed('{"TYPE": Mine}', '{"odd": dict}'),
+    "it has no method update": changed("update", "renew"),
+    "its update(time_ns) cannot be called as update(time_ns, period_ns)": changed(
         "update(self, time_ns, period_ns)", "update(self, time_ns)"
     ),
-    "whose Parameters is not a model of parameters": declares("Parameters = dict"),
-    "whose Commands is of a wrong type: Expected `object`": declares("Commands = ('move',)"),
-    "whose command move is not a model of a command": declares("Commands = {'move': dict}"),
-    "whose publishes is of a wrong type: Expected `array`, got `str`": declares(
-        "publishes = '/joint_states'"
-    ),
-    "whose Topics is of a wrong type: Expected `object`": declares("Topics = ('state',)"),
-    "whose topic state has no message of ROS 2: dict is not a dataclass; put @dataclass above": declares(
+    "its Parameters is not a parameters model": declares("Parameters = dict"),
+    "its Commands has the wrong type: Expected `object`": declares("Commands = ('move',)"),
+    "its command move is not a command model": declares("Commands = {'move': dict}"),
+    "its publishes has the wrong type: Expected `array`, got `str`": declares("publishes = '/joint_states'"),
+    "its Topics has the wrong type: Expected `object`": declares("Topics = ('state',)"),
+    "its topic state has no ROS 2 message: dict is not a dataclass; put @dataclass above": declares(
         "Topics = {'state': dict}"
     ),
 }
@@ -168,9 +166,9 @@ def test_all_classes_are_imported_before_the_loop_and_checked_each(install, tmp_
 @pytest.mark.parametrize(
     ("place", "says"),
     [
-        ("nowhere:Mine", "cannot be imported from nowhere:Mine (ModuleNotFoundError"),
-        ("my_law:Other", "cannot be imported from my_law:Other (AttributeError"),
-        ("my_law:Wrong", "offers Wrong as my_type, which is not a controller"),
+        ("nowhere:Mine", "but nowhere:Mine cannot be imported (ModuleNotFoundError"),
+        ("my_law:Other", "but my_law:Other cannot be imported (AttributeError"),
+        ("my_law:Wrong", "offers Wrong as my_type: it is not a controller"),
     ],
 )
 def test_a_class_that_is_named_by_its_place_is_imported_when_it_is_used(install, tmp_path, place, says):

@@ -92,7 +92,7 @@ def test_a_refused_policy_names_the_consequence_and_the_fix(asked, monkeypatch):
     grant = realtime_grants.apply_scheduler(SchedulerPlan("round_robin", 31, False))[-1]
     assert not grant.granted
     assert "round_robin 31 was refused" in grant.sentence
-    assert "may delay it" in grant.sentence
+    assert "may delay this process" in grant.sentence
     assert "rtprio 32" in grant.fix  # the guardian needs one more
     assert "rtprio 32" in realtime_grants.apply_to_guardian(32, lock=False)[0].fix
     assert grant.full_sentence == f"{grant.sentence}: {grant.fix}"
@@ -119,8 +119,8 @@ def invalid(*_):
 @pytest.mark.parametrize(
     ("asked_for", "changed", "sentence"),
     [
-        ((3, 9), {}, "there is no core 9 for this process, it runs on 0, 1, 2, 3"),
-        ((9,), {"sched_setaffinity": invalid}, "there is no core 9 for this process, it runs on 0, 1, 2, 3"),
+        ((3, 9), {}, "this process cannot run on core 9; it runs on 0, 1, 2, 3"),
+        ((9,), {"sched_setaffinity": invalid}, "this process cannot run on core 9; it runs on 0, 1, 2, 3"),
         ((2,), {"sched_getaffinity": lambda _: {2}}, "stays on core 2"),
     ],
 )
@@ -146,7 +146,7 @@ def test_another_system_is_a_refusal_and_not_a_crash(asked, may, monkeypatch):
     plan = SchedulerPlan("fifo", 40, True, cores=(1,))
     for grant in realtime_grants.apply_scheduler(plan)[1:]:
         assert not grant.granted
-        assert "this system does not offer it" in grant.sentence
+        assert "not available on this system" in grant.sentence
 
 
 def test_a_c_library_without_mallopt_is_a_refusal(asked, monkeypatch):
@@ -236,9 +236,9 @@ def test_the_margin_covers_what_sleeps_overshoot_within_its_bounds(most_ns, late
     usual_ns = sorted(late_ns)[min(len(late_ns) - 1, 30)]
     assert (clock.spin_ns, grant.granted) == (margin_ns, True)
     assert grant.sentence == (
-        f"polls the clock for {margin_ns // 1000} us before each deadline, {margin_ns / period_ns:.1%} of a "
-        f"core; 19 of 20 sleeps woke at most {usual_ns // 1000} us late"
-        + ", so that some cycles begin late"
+        f"polls the clock for {margin_ns // 1000} us before each deadline ({margin_ns / period_ns:.1%} of a "
+        f"core); 19 of 20 sleeps woke at most {usual_ns // 1000} us late"
+        + ", so some cycles begin late"
         * (margin_ns < usual_ns)
     )
 

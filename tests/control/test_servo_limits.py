@@ -221,7 +221,7 @@ def test_limits_are_read_again_when_another_servo_took_the_place_of_a_lost_one(
     assert max(map(abs, sent)) == min(45, after)
     told = [event.text for event in replayed(log).events if event.code == EventCode.SERVO_LIMITS]
     texts = [f"goals of velocity are held to Velocity Limit (44) = {raw}, " for raw in (before, after)]
-    texts = ["registers of its servo no longer limit goals" if "1023" in one else one for one in texts]
+    texts = ["servo registers no longer limit goals" if "1023" in one else one for one in texts]
     assert len(told) == (1 if before == 1023 else 2)
     assert all(text in event for text, event in zip(reversed(texts), reversed(told), strict=False))
 
@@ -253,7 +253,7 @@ def test_a_velocity_limit_below_the_first_speed_is_reported_and_no_refusal(raw, 
 
 
 def test_a_velocity_limit_with_which_no_goal_is_taken_is_named_with_what_helps(tmp_path):
-    with pytest.raises(StartUpError, match=r"its Velocity Limit \(44\) is 0: write 1 or more there\n"):
+    with pytest.raises(StartUpError, match=r"raise its Velocity Limit \(44\) from 0 to 1 or more\n"):
         slow_robot(tmp_path, 0)
     slow_robot(tmp_path, 1)
 

@@ -111,7 +111,7 @@ def test_a_joint_without_torque_or_one_that_was_unloaded_refuses_it_and_all_stay
 def test_a_controller_that_was_not_declared_is_a_fault_of_the_one_that_requests_it(story):
     story.controller("safe", 0.5, **SPARE).watched(falls, takeovers=("other",))
     assert story.result.reason == "fault"
-    assert "watch requested that safe takes over, but that is not one of its takeovers" in story.result.detail
+    assert "watch requested a takeover by safe; add safe to its takeovers" in story.result.detail
 
 
 def test_the_one_that_requests_leaves_where_it_commands_the_same(story):
@@ -154,7 +154,7 @@ def test_takeover_over_a_lower_controller_that_waits_for_its_mode_is_refused(sto
     story.hardware.mode_cycles = lambda: 4
     story.run(10, {2: story.switches(["soft"])})
     why = "takeover by safe refused: soft is not active yet; wait until its joints have changed their modes"
-    assert story.events.texts(EventCode.COMMAND_REFUSED) == [f"{why} (reason of the request: it falls)"]
+    assert story.events.texts(EventCode.COMMAND_REFUSED) == [f"{why} (requested because: it falls)"]
     assert story.active(9) == ["soft", "watch"]
     assert story.order("activate") == ["watch", "soft"]
 

@@ -96,9 +96,9 @@ def test_publishing_nothing_marks_the_cycle():
 @pytest.mark.parametrize(
     ("topic", "message", "reason"),
     [
-        ("states", state(), r"published on states, which is not one of its Topics \(state, other\)"),
-        ("state", {"a": 1}, "published what its topic state does not take: it takes State, not dict"),
-        ("state", None, "it takes State, not NoneType"),
+        ("states", state(), r"published on states, but its Topics are state, other"),
+        ("state", {"a": 1}, "published an invalid message: topic state takes State, not dict"),
+        ("state", None, "topic state takes State, not NoneType"),
         ("state", State(Header(), [1.0]), "takes no such State.error: numbers come as an array"),  # type: ignore[arg-type]
         ("state", state(text="x" * LONGEST_MESSAGE), f"takes {LONGEST_MESSAGE} bytes at most, not 65"),
     ],
@@ -136,4 +136,4 @@ def test_nothing_is_published_before_the_activation():
 def test_a_controller_that_publishes_wrongly_is_ended_with_one_sentence(robot):
     result = robot.script("wave", on_update(lambda context, *_: context.publish("state", None))).run(4)
     assert result.reason == "fault"
-    assert result.detail == "controller wave published on state, which is not one of its Topics (none)"
+    assert result.detail == "controller wave published on state, but its Topics are none"

@@ -69,37 +69,36 @@ WRONG = {
     ),
     "return 4": (
         "return 7",
-        f"{WHO} was written for contract 7, this dxlrun has contract 4; install a matching version",
+        f"{WHO} was written for contract 7, but this dxlrun has contract 4; install a matching version",
     ),
     "def dxlrun_controllers()": (
         "def dxlrun_controllers(robot)",
-        f"{WHO} has a wrong hook (PluginValidationError: Plugin 'easing' for hook 'dxlrun_controllers' "
+        f"{WHO} has an invalid hook (PluginValidationError: Plugin 'easing' for hook 'dxlrun_controllers' "
         "hookimpl definition: dxlrun_controllers(robot) -> 'Mapping[str, type[Controller[Any]]]' "
         "Argument(s) {'robot'} are declared in the hookimpl but can not be found in the hookspec); "
         "report it to its author",
     ),
     "@hookimpl\ndef dxlrun_controllers": (
         "def dxlrun_controllers",
-        f"{WHO} has a function dxlrun_controllers that is not marked as a hook; "
-        "put @dxlrun.hookimpl above it",
+        f"{WHO} has an unmarked hook dxlrun_controllers; put @dxlrun.hookimpl above this function",
     ),
     "def update(self, time_ns: int, period_ns: int)": (
         "def update(self, period_ns: int)",
-        f"{WHO} offers Easing as easing_position_controller, whose update(period_ns) cannot be called as "
-        "update(time_ns, period_ns); give it these arguments",
+        f"{WHO} offers Easing as easing_position_controller: its update(period_ns) cannot be called as "
+        "update(time_ns, period_ns); declare these arguments",
     ),
     "    def update(": (
         "    def renew(",
-        f"{WHO} offers Easing as easing_position_controller, which has no method update; write it",
+        f"{WHO} offers Easing as easing_position_controller: it has no method update; add the method",
     ),
     "class EasingParameters(ParametersModel)": (
         "class EasingParameters",
-        f"{WHO} offers Easing as easing_position_controller, whose Parameters is not a model of parameters; "
+        f"{WHO} offers Easing as easing_position_controller: its Parameters is not a parameters model; "
         "derive it from dxlrun.ParametersModel",
     ),
     '{"positions": PositionsCommand}': (
         "(PositionsCommand,)",
-        f"{WHO} offers Easing as easing_position_controller, whose Commands is of a wrong type: Expected "
+        f"{WHO} offers Easing as easing_position_controller: its Commands has the wrong type: Expected "
         "`object`, got `array`; write {name: class of dxlrun.CommandModel}",
     ),
 }
@@ -121,19 +120,19 @@ ASKED = {
     ),
     'parameters.joints, ("position",)': (
         'list(parameters.joints), ("position",)',
-        "returns wrong interfaces: lists, which may change later; "
-        "report it to its author: write tuples of names as dxlrun.Interfaces has them",
+        "returns lists in its interfaces; "
+        "report it to its author: write tuples of names, as in dxlrun.Interfaces",
     ),
     ', ("position",))': (
         ', ("position", "pwm"))',
-        "asks for command interfaces that do not go together: no servo mode combines position and pwm; "
-        "report it to its author: ask for position (with velocity or effort in addition), or for "
+        "requests incompatible command interfaces: no servo mode combines position and pwm; "
+        "report it to its author: request position (alone, or with velocity or effort), or "
         "velocity, effort or pwm alone",
     ),
     '("position",))': (
         '("torque",))',
         "returns wrong interfaces: Invalid enum value 'torque' - at `$.command[0]`; "
-        "report it to its author: write tuples of names as dxlrun.Interfaces has them",
+        "report it to its author: write tuples of names, as in dxlrun.Interfaces",
     ),
 }
 

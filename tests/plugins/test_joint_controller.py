@@ -195,7 +195,7 @@ WRONG = {
     ),
     "no law": (
         ("def positions", "def position_s"),
-        "which has no method positions, velocities, efforts; write",
+        "it has no method positions, velocities, efforts; write",
     ),
     "a law without dt": (
         (", dt: float", ""),

@@ -155,7 +155,7 @@ def test_plugins_are_listed_with_what_they_offer(said: Said, install: Callable[[
     assert ["joint_trajectory_controller", "chunk", "trajectory"] in [line[:3] for line in lines]
     assert (
         "broken: plug-in broken_one of broken_one 1.5 was written for contract 5, "
-        "this dxlrun has contract 4; install a matching version"
+        "but this dxlrun has contract 4; install a matching version"
     ) in out
 
 

@@ -45,7 +45,7 @@ _WHAT = {
     Clamp.NOT_FINITE: "not finite; the last goal is kept",
     Clamp.EFFORT: "held to the effort limit",
     Clamp.PWM: "held to the full voltage",
-    Clamp.OUTWARD: "stopped: it leads out of the position limits",
+    Clamp.OUTWARD: "stopped at the position limit",
 }
 _LIMITED: Mapping[Clamp, LimitedInterface] = {
     Clamp.VELOCITY: "velocity",

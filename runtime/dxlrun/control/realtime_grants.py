@@ -154,7 +154,7 @@ def _requested(request: str) -> Callable[[Callable[P, str]], Callable[P, Grant]]
             except _GrantRefusal as refused:
                 return Grant(request, False, *refused.args)
             except (AttributeError, OSError, ValueError) as error:
-                return Grant(request, False, f"{request}: this system does not offer it ({error})")
+                return Grant(request, False, f"{request}: not available on this system ({error})")
 
         return attempt
 
@@ -171,14 +171,14 @@ def set_policy(policy: Policy, priority: int, limit: int | None = None) -> str:
         limit: rtprio limit for the fix of a refusal, if another process needs more than `priority`.
     """
     if policy == "other":
-        return "the ordinary scheduler was asked for"
+        return "ordinary scheduler, as requested"
     kind = os.SCHED_FIFO if policy == "fifo" else os.SCHED_RR
     try:
         os.sched_setscheduler(0, kind | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
     except PermissionError:
         raise _GrantRefusal(
-            f"scheduler {policy} {priority} was refused, it runs with ordinary priority and any busy "
-            "program may delay it by milliseconds",
+            f"scheduler {policy} {priority} was refused; busy programs may delay this process by "
+            "milliseconds",
             f"allow it with `{allow('rtprio', limit or priority)}` {_AGAIN}",
         ) from None
     return f"scheduler {policy}, priority {priority}"
@@ -217,7 +217,7 @@ def _short_slice() -> tuple[Grant, ...]:
         return ()
     if _SCHED_ATTR.unpack(found.raw)[5] != SLICE_NS:
         return ()
-    sentence = f"time slices of {SLICE_NS / 1e6:g} ms, they begin sooner than those of other programs"
+    sentence = f"time slices of {SLICE_NS / 1e6:g} ms, scheduled before longer ones"
     return (Grant("time slice", True, sentence),)
 
 
@@ -227,17 +227,18 @@ def _stay_on(cores: Sequence[int]) -> str:
 
     Linux ignores cores that do not exist (sched_setaffinity(2)).
     """
-    before, fix = os.sched_getaffinity(0), "write others under loop.scheduler.cores"
+    before, fix = os.sched_getaffinity(0), "write other cores under loop.scheduler.cores"
     try:
         os.sched_setaffinity(0, cores)
     except OSError:
         found, missing = sorted(before), list(cores)
     else:
         found = sorted(os.sched_getaffinity(0))
-        missing, fix = sorted(set(cores) - set(found)), "remove it from loop.scheduler.cores"
+        missing = sorted(set(cores) - set(found))
+        fix = f"remove {_listed(missing)} from loop.scheduler.cores"
     if missing:
         raise _GrantRefusal(
-            f"there is no core {_listed(missing)} for this process, it runs on {_listed(found)}", fix
+            f"this process cannot run on core {_listed(missing)}; it runs on {_listed(found)}", fix
         )
     return f"stays on {'core' if len(found) == 1 else 'cores'} {_listed(found)}"
 
@@ -250,10 +251,10 @@ def _listed(cores: Sequence[int]) -> str:
 def _keep_memory() -> str:
     kept = keep_freed()
     touch_memory()
-    touched = f"{HEAP >> 20} MiB of heap and the stack are touched, what is freed"
+    touched = f"{HEAP >> 20} MiB of heap and the stack are touched"
     if not kept:
-        raise _GrantRefusal(f"{touched} goes back to the kernel, mallopt is missing")
-    return f"{touched} is kept"
+        raise _GrantRefusal(f"{touched}; freed memory returns to the kernel, as mallopt is missing")
+    return f"{touched}; freed memory is kept"
 
 
 @_requested("locked memory")
@@ -264,7 +265,7 @@ def lock_memory() -> str:
     """
     if not may_lock():
         raise _GrantRefusal(
-            "memory is not locked, a page that was swapped out may delay it by milliseconds",
+            "memory is not locked; a swapped page may delay this process by milliseconds",
             f"allow it with `{allow('memlock', 'unlimited')}` {_AGAIN}",
         )
     succeed(libc().mlockall(_MCL_CURRENT | _MCL_FUTURE))  # mlockall(2)
@@ -277,7 +278,7 @@ def keep_awake() -> str:
     try:
         descriptor = os.open(IDLE_LATENCY, os.O_WRONLY)
     except PermissionError:
-        sentence = "cores may sleep deeply and wake some 100 us late"
+        sentence = "cores may enter deep idle states and wake about 100 us late"
         raise _GrantRefusal(sentence, f"allow it with `{allow_idle_latency()}`") from None
     os.write(descriptor, struct.pack("i", 0))  # never closed: the request ends with the descriptor
     return "cores are kept from deep idle states"
@@ -423,9 +424,9 @@ class Pacing:
         return Grant(
             "polling",
             True,
-            f"polls the clock for {margin_ns / 1e3:.0f} us before each deadline, {margin_ns / period_ns:.1%} "
-            f"of a core; 19 of 20 sleeps woke at most {usual_ns / 1e3:.0f} us late"
-            + ("" if margin_ns >= usual_ns else ", so that some cycles begin late"),
+            f"polls the clock for {margin_ns / 1e3:.0f} us before each deadline ({margin_ns / period_ns:.1%} "
+            f"of a core); 19 of 20 sleeps woke at most {usual_ns / 1e3:.0f} us late"
+            + ("" if margin_ns >= usual_ns else ", so some cycles begin late"),
         )
 
     def set_period(self, period_ns: int) -> None:

@@ -290,8 +290,8 @@ class PlannedCommands:
         """Check one executed command. Raises LogError if the run did not execute it in this cycle."""
         if command.planned >= 0 and (command.cycle, command.controller, command.kind) not in self._then:
             raise LogError(
-                f"{self._log}: {command.kind} of the plan for {command.controller} was not taken by cycle "
-                f"{command.cycle} in the run, but is due then: the log is damaged"
+                f"{self._log} is damaged: cycle {command.cycle} lacks the planned {command.kind} for "
+                f"{command.controller}"
             )
 
 
@@ -350,7 +350,7 @@ class RecordedRun:
     ) -> None:
         features = find_installed(plan.features)
         self._missing = [
-            f"the run had {one.name} of {one.distribution}, which is not installed here: what it watched is "
+            f"the run had {one.name} of {one.distribution}; it is not installed here, so its monitoring is "
             "not replayed"
             for one in plan.features
             if one.name not in {each.name for each in features}

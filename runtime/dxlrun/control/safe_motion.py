@@ -106,7 +106,7 @@ class SafeMotion:
         if self._began_ns < 0:
             self._began_ns = self._step_ns = now_ns
         if now_ns - self._began_ns >= self.context.plan.policies.limit_ns:
-            self.give_up("its time is over")
+            self.give_up("its time limit has passed")
         if self._changing(now_ns):
             return
         while not self.over and self._ended(self.policy.steps[self._index], now_ns):

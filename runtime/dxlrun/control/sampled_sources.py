@@ -132,7 +132,7 @@ class SampledSource:
             ahead_ns = int(t_ns) - now_ns
             if ahead_ns > self._period_ns and not self._ahead:
                 self._ahead = True
-                self._say(f"its times are {ahead_ns / 1e6:.0f} ms in the future: times of arrival are used")
+                self._say(f"its timestamps are {ahead_ns / 1e6:.0f} ms in the future; arrival times are used")
             # A time in the future would make the sample younger than it is.
             self._writer.write_sample(min(int(t_ns), now_ns), self._values)
         except Exception as error:  # every error of a driver becomes an event

@@ -125,7 +125,7 @@ def command_refused(kind: str, origin: str, refusal: str) -> str:
 
 @event_text(EventCode.COMMAND_REFUSED, Severity.WARNING)
 def takeover_refused(controllers: str, refusal: str, because: str) -> str:
-    return f"takeover by {controllers} refused: {refusal} (reason of the request: {because})"
+    return f"takeover by {controllers} refused: {refusal} (requested because: {because})"
 
 
 @event_text(EventCode.COMMAND_REFUSED, Severity.WARNING)
@@ -135,7 +135,7 @@ def controller_not_activated(controller: str, problem: str) -> str:
 
 @event_text(EventCode.COMMAND_REFUSED, Severity.WARNING)
 def fallback_refused(controller: str, refusal: str) -> str:
-    return f"{controller} does not take over: {refusal}"
+    return f"{controller} cannot take over: {refusal}"
 
 
 # Controllers
@@ -163,7 +163,7 @@ def controller_deactivated() -> str:
 
 @event_text(EventCode.MODE, Severity.INFO)
 def controller_waits_for_modes() -> str:
-    return "waits until its joints are in their modes"
+    return "waits for the mode changes of its joints"
 
 
 @event_text(EventCode.CONTROLLER_FAULT, Severity.ERROR)
@@ -190,7 +190,7 @@ def controllers_take_over(names: Sequence[str], replaced: Sequence[str], because
 
 @event_text(EventCode.KEPT, Severity.INFO)
 def kept_state_used(size: int, file: str) -> str:
-    return f"starts with the {size} bytes of its kept state ({file})"
+    return f"starts with its kept state of {size} bytes ({file})"
 
 
 @event_text(EventCode.KEPT, Severity.WARNING)
@@ -231,7 +231,7 @@ def clamp_ended(joint: str, clamp: str, lasted_ns: int) -> str:
 
 @event_text(EventCode.GATE, Severity.WARNING)
 def source_command_clamped(source: str, command: str, value: float, lowest: float, highest: float) -> str:
-    return f"{source}: {command} = {value:.6g} is held to its range {lowest:.6g}..{highest:.6g}"
+    return f"{source}: {command} = {value:.6g} is clamped to its range {lowest:.6g}..{highest:.6g}"
 
 
 @event_text(EventCode.SERVO_LIMITS, Severity.INFO)
@@ -246,14 +246,14 @@ def servo_limits_tighter_than_file(joint: str, limits: str) -> str:
 
 @event_text(EventCode.SERVO_LIMITS, Severity.INFO)
 def servo_limits_gone(joint: str) -> str:
-    return f"{joint}: registers of its servo no longer limit goals"
+    return f"{joint}: servo registers no longer limit goals"
 
 
 # Reasons: the end of a run, and of a hook
 
 
 def overrun_ends_run(cycle: int) -> str:
-    return f"cycle {cycle} ended after the next deadline, and the robot file has `overrun: stop`"
+    return f"cycle {cycle} ended after the next deadline (`overrun: stop` in the robot file)"
 
 
 def monitor_failed(monitor: type, error: BaseException) -> str:
@@ -274,9 +274,9 @@ def run_ended_by(controller: str, because: str) -> str:
 
 # Refusals: problems and hints; their sentences are in `channels/answers.py`
 
-WRONG_MOTION_SIZES = "the motion's array does not have the sizes of its parts"
-WAIT_FOR_JOINT = "try again when it is back; it is probed once a second"
-WAIT_FOR_REBOOT = "it reboots as requested: try again when it is back"
+WRONG_MOTION_SIZES = "the motion's array does not match the sizes of its parts"
+WAIT_FOR_JOINT = "try again when it answers; dxlrun probes it once a second"
+WAIT_FOR_REBOOT = "it is rebooting, as requested; try again when it answers"
 
 
 def unknown_loop_command(kind: str, known: Iterable[str]) -> str:
@@ -284,7 +284,7 @@ def unknown_loop_command(kind: str, known: Iterable[str]) -> str:
 
 
 def wrong_command_data(kind: str, error: object) -> str:
-    return f"the data of {kind} do not fit: {error}"
+    return f"wrong data for {kind}: {error}"
 
 
 def not_numbers(size: int) -> str:
@@ -292,7 +292,7 @@ def not_numbers(size: int) -> str:
 
 
 def no_single_goal(controller: str) -> str:
-    return f"the part of {controller} has no single goal"
+    return f"the motion's part for {controller} must be one goal, at its start"
 
 
 def command_upper(upper: str) -> str:
@@ -304,11 +304,11 @@ def deactivate_upper(upper: str) -> str:
 
 
 def mode_of_one_joint(joint: str, others: str) -> str:
-    return f"it needs another mode of {joint}, but not of {others}: the same servos move both"
+    return f"it changes the mode of {joint}, but not of {others}; both share their servos"
 
 
 def torque_on(names: Sequence[str]) -> str:
-    return f"`dxlrun torque on {' '.join(names)}` gives it torque"
+    return f"switch torque on with `dxlrun torque on {' '.join(names)}`"
 
 
 def move_inside_first(joints: Sequence[str], hint: str) -> str:
@@ -320,11 +320,11 @@ def reboot_after_cause(joints: Sequence[str]) -> str:
 
 
 def lower_not_active(controller: str) -> str:
-    return f"{controller} below it is not active"
+    return f"its lower controller {controller} is not active"
 
 
 def lower_failed(controller: str) -> str:
-    return f"{controller} below it broke its contract"
+    return f"its lower controller {controller} broke its contract"
 
 
 # Consequences of commands that do not come any more

@@ -118,7 +118,7 @@ def test_a_missing_plug_in_and_parameters_that_the_installed_one_refuses(
     parameters = '{"joints": ["tilt", "nod"], "gian": 1}'
     path = changed(pair_log, of_controller("all_inputs", parameters=parameters))
     assert refused(path, PlugInError) == (
-        "the parameters of a controller: all_inputs has an unknown key 'gian'; did you mean gain?"
+        "wrong controller parameters: all_inputs has an unknown key 'gian'; did you mean gain?"
     )
 
 

@@ -142,7 +142,7 @@ class Activity:
     def _fault(self, place: int, what: str, started: str, raised: BaseException | None) -> ControllerFault:
         if started:
             text = (
-                f"{started} in {what}: while the robot runs that would stop the loop; "
+                f"{started} in {what}; this would stop the running loop: "
                 "start a process in on_configure instead"
             )
         elif isinstance(raised, ControllerFault):  # raised by the context, with a complete sentence
@@ -190,7 +190,9 @@ def _refuse(what: str) -> None:
     activity = Activity.guarded
     if activity is not None and activity.thread == _ident():
         activity.refused = what
-        raise RuntimeError(f"a controller cannot start {what} while the robot runs")
+        raise RuntimeError(
+            f"a controller cannot start {what} while the robot runs; start a process in on_configure"
+        )
 
 
 def _audit(event: str, _: tuple[object, ...]) -> None:

@@ -102,7 +102,7 @@ class PlayedMotion(msgspec.Struct):
         if self.next == len(self.commands) and passed_ns >= end_ns:
             given = self.part.positions
             positions = np.array([np.nan if one is None else one for one in given]) if given else None
-            self.goal.judge(positions, text="all commands were given")
+            self.goal.judge(positions, text="all commands were sent")
         else:
             self.goal.feedback(min(1.0, passed_ns / end_ns) if end_ns > 0 else 0.0)
 

@@ -94,7 +94,7 @@ class StateKeeper:
         if not isinstance(state, bytes):
             raise ControllerFault(f"kept {type(state).__name__}, not bytes")
         if len(state) > MOST_KEPT:
-            raise ControllerFault(f"kept {len(state)} bytes; {MOST_KEPT} is the most")
+            raise ControllerFault(f"kept {len(state)} bytes, more than {MOST_KEPT}")
         self._waiting[controller] = self._newest[controller] = state
 
     def publish_next(self) -> None:

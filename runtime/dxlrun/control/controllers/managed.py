@@ -231,7 +231,7 @@ class ManagedController:
         """
         before, after = self.active, TRANSITIONS[self.state].get(event)
         if after is None:
-            text = f"is {self.state.value}, where {event.value} cannot happen"
+            text = f"is {self.state.value}; {event.value} is invalid in this state"
             raise ControllerFault(f"controller {self.plan.name} {text}")
         self.state = after
         self.failed |= event is ControllerEvent.FAULT
@@ -456,7 +456,7 @@ def _take_over(
     Raises ControllerFault for one not in its `takeovers`.
     """
     if other := [name for name in controllers if name not in plan.takeovers]:
-        raise ControllerFault(f"requested that {other[0]} takes over, but that is not one of its takeovers")
+        raise ControllerFault(f"requested a takeover by {other[0]}; add {other[0]} to its takeovers")
     if controllers:
         requests.append(ControllerRequest(plan.name, tuple(controllers), why))
 

@@ -216,7 +216,7 @@ class Manager:
         goal = managed.goal
         led = goal is not None and (goal.is_judged or managed.plan.name in self._motions)
         if goal is not None and led and goal is not pursued:
-            goal.end(Outcome.PREEMPTED, "another command took its place")
+            goal.end(Outcome.PREEMPTED, "replaced by another command")
         streaming = command.lease_ns and managed.until_ns
         try:
             managed.give_command(kind, data)
@@ -372,7 +372,7 @@ class Manager:
 
     def _accept(self, managed: ManagedController, kind: str, origin: str) -> RunningGoal:
         if (before := managed.goal) is not None:
-            before.end(Outcome.PREEMPTED, f"goal {self._goals.last + 1} took its place")
+            before.end(Outcome.PREEMPTED, f"replaced by goal {self._goals.last + 1}")
         return self._goals.accept_goal(managed.plan.name, kind, origin)
 
     def _begin_goal(

@@ -45,13 +45,13 @@ class OfferStage(msgspec.Struct, frozen=True):
 def methods_breach(found: object, base: type, names: Sequence[str]) -> Breach | None:
     """Return the first method in `names` that a class lacks, or declares with other arguments than `base`."""
     if missing := sorted(getattr(found, "__abstractmethods__", ())):
-        return f"which has no method {' and no method '.join(missing)}", "write it"
+        return f"it has no method {' and no method '.join(missing)}", "add the method"
     for name in names:
         own, expected = getattr(found, name), getattr(base, name)
         if not takes(own, expected):
             return (
-                f"whose {name}{arguments(own)} cannot be called as {name}{arguments(expected)}",
-                "give it these arguments",
+                f"its {name}{arguments(own)} cannot be called as {name}{arguments(expected)}",
+                "declare these arguments",
             )
     return None
 

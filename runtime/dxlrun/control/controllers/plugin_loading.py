@@ -285,7 +285,7 @@ class PlugIns(msgspec.Struct, frozen=True):
             from dxlrun.description.form_problems import sentences_of
 
             wrong = "; ".join(sentences_of(error, plan.name, offer.controller.Parameters, _MOST_MISTAKES))
-            raise PlugInError(f"the parameters of a controller: {wrong}") from error
+            raise PlugInError(f"wrong controller parameters: {wrong}") from error
         except (Exception, SystemExit) as error:  # foreign code: one sentence instead of its traceback
             raise ControllerFault(
                 f"controller {plan.name} cannot be built: {type(error).__name__}: {error}"
@@ -355,8 +355,8 @@ def _together(
         for name in types:
             if (first := publishers.setdefault(name, publisher)) != publisher or name in made:
                 twice[name] = (
-                    f"{first} and {publisher} both offer a {what} of type {name}; neither is used: "
-                    "uninstall one of them, or ask an author for another name"
+                    f"{first} and {publisher} both offer a {what} of type {name}, so neither is used: "
+                    "uninstall one of them, or ask an author to rename it"
                 )
         made |= types
     broken |= twice
@@ -381,13 +381,13 @@ def _load(plugin: InstalledPlugin) -> LoadedPlugIn:
     module = _asked(make_error, "cannot be imported", plugin.point.load, "reinstall it, or ")
     unmarked = [name for name, hook in _functions(module) if not hasattr(hook, f"{GROUP}_impl")]
     if unmarked:
-        what = f"has a function {unmarked[0]} that is not marked as a hook"
-        raise make_error(what, "put @dxlrun.hookimpl above it")
+        what = f"has an unmarked hook {unmarked[0]}"
+        raise make_error(what, "put @dxlrun.hookimpl above this function")
     manager = pluggy.PluginManager(GROUP)
     manager.add_hookspecs(HookSpecs)
     # The errors of pluggy name hooks that do not exist and wrong arguments.
-    _asked(make_error, "has a wrong hook", partial(manager.register, module, plugin.name))
-    _asked(make_error, "has a wrong hook", manager.check_pending)
+    _asked(make_error, "has an invalid hook", partial(manager.register, module, plugin.name))
+    _asked(make_error, "has an invalid hook", manager.check_pending)
     contracts, controllers, servo_models, commands = (
         _asked(make_error, "raised in a hook", getattr(manager.hook, f"dxlrun_{name}"))
         for name in ("contract", "controllers", "servo_models", "commands")
@@ -401,7 +401,7 @@ def _load(plugin: InstalledPlugin) -> LoadedPlugIn:
     contract = contracts[0]
     if not (type(contract) is int and 1 <= contract <= CONTRACT_VERSION):
         raise make_error(
-            f"was written for contract {contract!r}, this dxlrun has contract {CONTRACT_VERSION}",
+            f"was written for contract {contract!r}, but this dxlrun has contract {CONTRACT_VERSION}",
             "install a matching version",
         )
     return LoadedPlugIn(
@@ -461,7 +461,7 @@ def _itself(made: Offered) -> Offered:
 
 def _imported(name: str, place: str, refuse: Refuse, offer: Callable[[str, object], Offered]) -> Offered:
     module, _, attribute = place.partition(":")
-    what = f"offers {name}, which cannot be imported from {place}"
+    what = f"offers {name}, but {place} cannot be imported"
     return offer(name, _asked(refuse, what, lambda: getattr(import_module(module), attribute)))
 
 
@@ -500,7 +500,7 @@ def _add_servo_models(models: object, refuse: Refuse) -> list[str]:
             table = add_device_table(text) if is_device_table(text) else add_control_table(text)
         except (OSError, ValueError) as error:
             raise refuse(
-                f"offers a servo model {where}that cannot be used ({_one_line(error)})",
+                f"offers an unusable servo model {where}({_one_line(error)})",
                 "report it to its author",
             ) from error
         names.append(table.model)
@@ -523,7 +523,7 @@ def _check(breach: Breach | None, kind: object, name: str, refuse: Refuse) -> No
     if breach is not None:
         what, fix = breach
         shown = kind.__qualname__ if isinstance(kind, type) else repr(kind)
-        raise refuse(f"offers {shown} as {name}, {what}", fix)
+        raise refuse(f"offers {shown} as {name}: {what}", fix)
 
 
 # The contract
@@ -532,16 +532,16 @@ def _check(breach: Breach | None, kind: object, name: str, refuse: Refuse) -> No
 def controller_breach(controller: object) -> Breach | None:
     """Check a class that is offered as a controller; return the first violation of the contract, or None."""
     if not (isinstance(controller, type) and issubclass(controller, Controller)):
-        return "which is not a controller", "derive a class from dxlrun.Controller"
+        return "it is not a controller", "derive it from dxlrun.Controller"
     if breach := methods_breach(controller, Controller, _METHODS) or _laws_breach(controller):
         return breach
     if not is_model(controller.Parameters, ParametersModel):
-        return "whose Parameters is not a model of parameters", "derive it from dxlrun.ParametersModel"
+        return "its Parameters is not a parameters model", "derive it from dxlrun.ParametersModel"
     for name, (kind, fix) in _DECLARED.items():
         try:
             msgspec.convert(getattr(controller, name), kind)
         except msgspec.ValidationError as error:
-            return f"whose {name} is of a wrong type: {error}", fix
+            return f"its {name} has the wrong type: {error}", fix
     return _commands_breach(controller) or _topics_breach(controller.Topics)
 
 
@@ -549,16 +549,16 @@ def _laws_breach(controller: ControllerClass) -> Breach | None:
     if not issubclass(controller, JointController):
         return None
     if not laws_of(controller):
-        return f"which has no method {', '.join(LAWS)}", "write `def positions(self, time, dt):`"
+        return f"it has no method {', '.join(LAWS)}", "write `def positions(self, time, dt):`"
     return methods_breach(controller, JointController, ("begin", *LAWS))
 
 
 def _commands_breach(controller: ControllerClass) -> Breach | None:
     commands, goals = controller.Commands, controller.Goals
     if wrong := [kind for kind, model in commands.items() if not is_model(model, CommandModel)]:
-        return f"whose command {wrong[0]} is not a model of a command", "derive it from dxlrun.CommandModel"
+        return f"its command {wrong[0]} is not a command model", "derive it from dxlrun.CommandModel"
     if goals and controller.on_goal is Controller.on_goal:
-        return "which has Goals and no method on_goal", "write it"
+        return "it has Goals, but no method on_goal", "add the method"
     return None
 
 
@@ -567,7 +567,7 @@ def _topics_breach(topics: Mapping[str, type]) -> Breach | None:
         try:
             declared_message(message, "any")
         except WrongMessage as wrong:
-            return f"whose topic {topic} has no message of ROS 2: {wrong.what}", wrong.fix
+            return f"its topic {topic} has no ROS 2 message: {wrong.what}", wrong.fix
     return None
 
 
@@ -587,42 +587,42 @@ def interfaces_breach(interfaces: object, *, chained: bool = False) -> Breach | 
         mode_of(("position",) if chained else interfaces.command or ("position",))
     except ValueError as error:
         return (
-            f"asks for command interfaces that do not go together: {error}",
-            "ask for position (with velocity or effort in addition), or for velocity, effort or pwm alone",
+            f"requests incompatible command interfaces: {error}",
+            "request position (alone, or with velocity or effort), or velocity, effort or pwm alone",
         )
     return None
 
 
 def _names_breach(interfaces: Interfaces) -> Breach | None:
-    fix = "write tuples of names as dxlrun.Interfaces has them"
+    fix = "write tuples of names, as in dxlrun.Interfaces"
     try:
         asked = msgspec.convert(asdict(interfaces), Interfaces)
     except msgspec.ValidationError as error:
         return f"returns wrong interfaces: {error}", fix
     if asked != interfaces:
-        return "returns wrong interfaces: lists, which may change later", fix
+        return "returns lists in its interfaces", fix
     if wrong := [name for name in interfaces.provides if not name or "/" in name]:
         return f"provides {', '.join(map(repr, wrong))}", "name a state as orientation.x"
     figures = MotorModel.__struct_fields__
     if strange := [name for name in interfaces.motors if name not in figures]:
-        return f"needs the {', '.join(strange)} of motors", f"a motor has {', '.join(figures)}"
+        return f"needs unknown motor data: {', '.join(strange)}", f"choose from {', '.join(figures)}"
     return None
 
 
 def motor_breach(needed: Sequence[str], joint: JointPlan) -> Breach | None:
     """Return the problem if a joint's motor model lacks figures that a controller needs, else None."""
-    identify = f"let `dxlrun identify {joint.name}` measure it, and name the file that it writes"
+    identify = f"measure it with `dxlrun identify {joint.name}`, and name the new file"
     if needed and joint.motor is None:
         return (
-            f"needs the motor of {joint.name}, which has no motor file",
+            f"needs the motor of {joint.name}, but {joint.name} has no motor file",
             f"{identify}: `motor: {joint.name}.motor.yaml` at the joint",
         )
     lacking = [name for name in needed if getattr(joint.motor, name) is None]
     if "torque_per_effort" in lacking:
-        what = f"needs the torque of {joint.name}, whose servo measures neither torque nor current"
+        what = f"needs the torque of {joint.name}, but its servo measures neither torque nor current"
         return what, "command positions or PWM instead"
     if lacking:
-        return f"needs the {', '.join(lacking)} of {joint.name}, which its motor file does not have", identify
+        return f"needs the {', '.join(lacking)} of {joint.name}, missing in its motor file", identify
     return None
 
 

@@ -117,7 +117,7 @@ class ControllerTopics:
         publisher = self._publishers.get(topic)
         if publisher is None:
             known = ", ".join(self._publishers) or "none"
-            raise ControllerFault(f"published on {topic}, which is not one of its Topics ({known})")
+            raise ControllerFault(f"published on {topic}, but its Topics are {known}")
         if not record.woken_ns:
             raise ControllerFault(f"published on {topic} before it was activated")
         cycle = record.cycle
@@ -129,4 +129,4 @@ class ControllerTopics:
         try:
             publisher.publish(message)
         except WrongMessage as error:
-            raise ControllerFault(f"published what its topic {topic} does not take: it {error}") from None
+            raise ControllerFault(f"published an invalid message: topic {topic} {error}") from None

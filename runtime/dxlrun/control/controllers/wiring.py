@@ -97,7 +97,7 @@ class Inputs:
         self._reads = np.full(len(plan.reads), np.nan)
         places = dict(_readable(record.layout)) if plan.reads else {}
         if missing := [name for name in plan.reads if name not in places]:
-            raise ControllerFault(f"controller {plan.name} reads {missing[0]}, which does not exist")
+            raise ControllerFault(f"controller {plan.name} reads {missing[0]}, but no source has it")
         at = np.array([places[name] for name in plan.reads], dtype=np.intp)
         if at.size:
             self._pairs.append((record.floats, self._reads, at))
@@ -204,7 +204,7 @@ class Outputs:
                 names = [f"{joint}/{interface}" for joint in plan.joints]
                 self._send(begin, names, getattr(record.commands, interface), rows, interface)
         if missing := [name for name in plan.source_commands if name not in layout.source_commands]:
-            raise ControllerFault(f"controller {plan.name} commands {missing[0]}, which no device has")
+            raise ControllerFault(f"controller {plan.name} commands {missing[0]}, but no device has it")
         places = _places(plan.source_commands, layout.source_commands)
         self._send(sources, plan.source_commands, record.source_commands, places)
         self._claimed = np.array([name != "" for name in self._names], dtype=np.bool_)
@@ -283,7 +283,7 @@ def _reference(plan: ControllerPlan, joint: str, interface: str, layout: CycleLa
     if len(found) != 1:
         many = "more than one" if found else "none"
         raise ControllerFault(
-            f"controller {plan.name} commands {joint}/{interface}, which {many} of "
-            f"{', '.join(plan.into)} exports"
+            f"controller {plan.name} commands {joint}/{interface}, but {many} of {', '.join(plan.into)} "
+            "exports it"
         )
     return found[0]
