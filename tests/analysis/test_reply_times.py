@@ -167,7 +167,7 @@ def test_an_adapter_that_is_late_is_named_with_its_timer_and_no_servo() -> None:
     assert [(one.code, one.subject) for one in findings(run(wakes=300.0), line=True)] == []
     (finding,) = findings(run(adapter=16_000.0), line=True)
     assert (finding.code, finding.subject) == ("late_replies", "main")
-    assert "that is a latency timer of 16 ms: 100% of its exchanges" in finding.sentence
+    assert "probably by a latency timer of 16 ms: 100% of its exchanges" in finding.sentence
     assert finding.remedy.startswith("`echo 1 | sudo tee /sys/")
 
 

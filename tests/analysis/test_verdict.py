@@ -246,7 +246,7 @@ def test_why_the_start_was_refused_is_said_first() -> None:
 
 def test_a_servo_that_answers_again_and_is_not_taken_back_is_told_with_why() -> None:
     again, buses = lost("elbow", count=3), plan(REAL, REAL)
-    why = "answers again, but cannot take part: elbow is model number 1030, not a XM430-W350 (1020)"
+    why = "answers again, but is not ready: elbow is model number 1030, not a XM430-W350 (1020)"
     returns = {"elbow": ["sends garbled or double replies", why]}
     verdict = judge_run(totals(events=(lost("wrist"), again), returns=returns, plan=buses))
     (servo,) = (one for one in verdict.findings if one.code == "servo_lost")
@@ -361,7 +361,7 @@ def exchanges(wire: Make, took_us: int, count: int = 25) -> list[Any]:
     [
         (300, 1, ""),
         (2900, 1, ""),
-        (3100, 1, "Replies on bus main come 3.1 ms later than the wire needs, and 1 ms were planned for the"),
+        (3100, 1, "Replies on bus main are delayed by 3.1 ms (planned for the adapter: 1 ms"),
         (
             15_800,
             1,

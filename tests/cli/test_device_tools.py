@@ -86,7 +86,7 @@ WRONG = (
     ),
     ((42, "set", "vdxl", 3), "Vdxl (32) can only be read"),
     ((42, "set", "led", 2), "LED (22) of an bitbots-core is 0..1, not 2"),
-    ((42, "set", "id", 9), "id of a device is not set by dxlrun"),
+    ((42, "set", "id", 9), "dxlrun does not set id of a device"),
     ((42, "get", "vbatt"), "has no vbatt"),
     ((241, "set", "accel_gain", "much"), "'much' is not a number; Accel Gain (110) is a float32"),
     ((241, "set", "gyro_range", 2), "not a terminal, cannot ask for confirmation"),

@@ -54,7 +54,7 @@ def test_registers_are_read_and_written_and_the_eeprom_only_when_it_was_asked_fo
     assert servo(1, "set", "position_p_gain", "900", *NEW).out.strip().endswith("was changed from 800 to 900")
     refused = servo(1, "set", "return_delay_time", "0", *NEW)
     assert refused.code == 2
-    assert "Return Delay Time (9) is 250 and becomes 0 (EEPROM): not a terminal, cannot ask" in refused.err
+    assert "Return Delay Time (9) changes from 250 to 0 (EEPROM): not a terminal, cannot ask" in refused.err
     assert "add --yes" in refused.err
     done = servo(1, "set", "return_delay_time", "100 us", "--yes", "--json", *NEW)
     result = result_of(done.out)
@@ -77,7 +77,7 @@ def test_a_tripped_bus_watchdog_is_shown_named_and_cleared(one):
     assert servo(1, "get", "bus_watchdog", *NEW).out.split()[-2:] == ["255", "tripped"]
     done = servo(1, "set", "goal_position", "1400", *NEW)
     assert done.code == 0, done.err
-    assert "cleared Bus Watchdog (98), which was 255 (tripped): it had stopped the servo" in done.out
+    assert "cleared Bus Watchdog (98) = 255 (tripped): it had stopped the servo" in done.out
     assert done.out.strip().endswith("to 1400")
     servo(1, "set", "bus_watchdog", "1", *NEW)
     time.sleep(0.2)
@@ -88,7 +88,7 @@ def test_a_tripped_bus_watchdog_is_shown_named_and_cleared(one):
 
 
 REFUSED = [
-    (("set", "id", "7"), "`dxlrun servo PORT ID id NEW` changes it"),
+    (("set", "id", "7"), "use `dxlrun servo PORT ID id NEW`"),
     (
         ("set", "position_gain", "7"),
         "has no register position_gain; did you mean position_d_gain or position_i_gain or position_p_gain?",
@@ -97,8 +97,8 @@ REFUSED = [
     (("set", "present_position", "7"), "Present Position (132) can only be read"),
     (("set", "goal_position", "fast"), "fast"),
     (("get", "gaol"), "has no gaol"),
-    (("baud", "12345"), "has no rate of 12345 bit/s; it has 9600, 57600"),
-    (("id", "253"), "253 is not an ID of Protocol 2.0; they are 0..252"),
+    (("baud", "12345"), "has no baud rate of 12345 bit/s; give one of 9600, 57600"),
+    (("id", "253"), "Protocol 2.0 has no ID 253; give one from 0 to 252"),
 ]
 
 
@@ -113,12 +113,12 @@ def test_what_the_model_does_not_have_is_reported(one):
 
 def test_a_servo_moves_to_another_id_and_rate_and_is_started_anew_and_reset(one):
     servo, finish = one()
-    assert "has ID 9; it had 1" in servo(1, "id", "9", "--yes", *NEW).out
-    assert "runs at 2000000 bit/s; before that, at 1000000" in servo(9, "baud", "2000000", "--yes", *NEW).out
+    assert "has ID 9 (before: 1)" in servo(1, "id", "9", "--yes", *NEW).out
+    assert "runs at 2000000 bit/s (before: 1000000)" in servo(9, "baud", "2000000", "--yes", *NEW).out
     fast = ("--protocol", "2.0", "--baud", "2000000")
     assert "rebooted, and is limp" in servo(9, "reboot", *fast).out
     reset = servo(9, "factory-reset", "--except", "id", "--yes", *fast)
-    assert "has the factory's values, ID 9 at 57600 bit/s" in reset.out
+    assert "has the factory values, ID 9 at 57600 bit/s" in reset.out
     missing = servo(9, "get", *fast)
     assert missing.code == 1
     assert "no servo with ID 9 answers at" in missing.err
@@ -150,11 +150,11 @@ def test_an_id_that_answers_in_two_places_is_asked_about(dxlrun, monkeypatch):
 
 def test_torque_and_led_need_no_question_and_torque_guards_the_eeprom(one):
     servo, _ = one()
-    assert "holds torque in position mode at tick 1304, where it stood" in servo(1, "torque", "on", *NEW).out
+    assert "holds torque in position mode at its present tick 1304" in servo(1, "torque", "on", *NEW).out
     refused = servo(1, "id", "5", "--yes", *NEW)
     assert refused.code == 1
     assert "holds torque, so ID (7) in its EEPROM was not written: switch the torque off" in refused.err
-    assert "holds torque: its torque goes off" in servo(1, "reboot", *NEW).err
+    assert "holds torque: the reboot switches it off" in servo(1, "reboot", *NEW).err
     assert "is limp" in servo(1, "torque", "off", *NEW).out
     assert "blinked 1 times" in servo(1, "blink", "1", *NEW).out
 
@@ -176,7 +176,7 @@ def test_a_backup_goes_into_a_file_and_back_into_another_servo(one, tmp_path, mo
     one_, two = (result_of(servo(each, "get", "--json", *words).out)["registers"] for each in (1, 2))
     differing = {name for name in one_ if one_[name] != two[name] and not name.startswith("present_")}
     assert differing <= {"id", "realtime_tick", "goal_position", "position_trajectory", "torque_limit"}
-    assert "has everything that" in servo(2, "restore", path, *words).out
+    assert "has all values of" in servo(2, "restore", path, *words).out
 
 
 def test_a_backup_of_another_model_is_refused(one, tmp_path):
@@ -187,7 +187,7 @@ def test_a_backup_of_another_model_is_refused(one, tmp_path):
     path.write_text(json.dumps(kept | {"model_number": 1020, "model": "XM430-W350"}))
     said = servo(1, "restore", path, "--yes", *NEW)
     assert said.code == 2
-    assert "is of a XM430-W350 of Protocol 2.0, not of a XL430-W250" in said.err
+    assert "is a backup of XM430-W350, Protocol 2.0, not of XL430-W250" in said.err
     path.write_text(json.dumps(kept | {"registers": {"led": 7, "lde": 1, "temperature_limit": "hot"}}))
     assert "is not a backup of a servo" in servo(1, "restore", path, "--yes", *NEW).err
     path.write_text(json.dumps(kept | {"registers": {"led": 7, "lde": 1}}))
@@ -199,9 +199,9 @@ def test_a_backup_of_another_model_is_refused(one, tmp_path):
 
 def test_a_servo_keeps_a_backup_of_its_own(one):
     servo, _ = one()
-    assert "stored its control table in its own backup" in servo(1, "backup", "--yes", *NEW).out
+    assert "stored its control table in its internal backup" in servo(1, "backup", "--yes", *NEW).out
     servo(1, "set", "return_delay_time", "0", "--yes", *NEW)
-    assert "took its EEPROM back" in servo(1, "restore", "--yes", *NEW).out
+    assert "restored its EEPROM from" in servo(1, "restore", "--yes", *NEW).out
     said = servo(1, "get", "return_delay_time", "--json", *NEW)
     assert result_of(said.out)["registers"] == {"return_delay_time": 250}
 

@@ -181,10 +181,7 @@ def test_a_register_is_set_while_the_robot_runs(dxlrun, torso: RemoteRobot) -> N
     assert dxlrun("set", "head_yaw_joint", "ccw_compliance_slope", "64").code == 0
     said = dxlrun("set", "head_yaw_joint", "temperature_limit", "70 degC")
     assert said.code == 2
-    assert (
-        "Temperature Limit (11) is in the EEPROM, which cannot be written while the servo has torque"
-        in said.err
-    )
+    assert "Temperature Limit (11) is in the EEPROM, not writable while the servo has torque" in said.err
 
 
 def test_a_goal_is_waited_for_and_reached(dxlrun, torso: RemoteRobot) -> None:
@@ -270,7 +267,7 @@ def test_a_joint_is_limp_and_holds_again_while_the_robot_runs(dxlrun, torso: Rem
     said = dxlrun("switch", "--activate", "head")
     assert (said.code, said.out) == (1, "")
     assert (
-        "head_yaw_joint (ID 21 on bus main) is limp; `dxlrun torque on head_yaw_joint` gives it torque"
+        "head_yaw_joint (ID 21 on bus main) is limp; switch torque on with `dxlrun torque on head_yaw_joint`"
         in said.err
     )
     said = dxlrun("get", "head_yaw_joint")

@@ -38,7 +38,10 @@ def played(program, *answers):
     ("answers", "problem"),
     [
         ((b"", b"\x10"), ""),
-        ((b"", b"\x03", b"", b"\x03", b"", b"\x03", b"\0"), "was given Operating Mode (11) = 16, but has 3"),
+        (
+            (b"", b"\x03", b"", b"\x03", b"", b"\x03", b"\0"),
+            "has Operating Mode (11) = 3 after 16 was written",
+        ),
         ((b"", TransactionOutcome.TIMEOUT), "did not answer when Operating Mode (11) was read back"),
         (
             (b"", b"\x03", b"", b"\x03", b"", b"\x03", b"\1"),
@@ -63,7 +66,7 @@ def test_a_refused_goal_names_the_register_that_bounds_it():
     hundred, more = (100).to_bytes(2, "little"), (900).to_bytes(2, "little")
     problem, sent = played(ONE.write_item("goal_pwm", -885), TransactionOutcome.REFUSED, hundred)
     assert problem.startswith("refuses Goal PWM (100) = -885: ")
-    assert problem.endswith("; its PWM Limit (36) is 100: write 885 or more there")
+    assert problem.endswith("; raise its PWM Limit (36) from 100 to 885 or more")
     assert sent == [(WRITE, 100), (READ, 36)]
     problem, _ = played(ONE.write_item("goal_pwm", 885), TransactionOutcome.REFUSED, more)
     assert "PWM Limit" not in problem
@@ -82,7 +85,7 @@ def test_a_register_is_written_again_until_it_is_read_back():
     right, wrong = (900).to_bytes(2, "little"), (800).to_bytes(2, "little")
     assert played(ONE.write_item(GAIN.name, GAIN.value), b"", wrong, b"", right)[0] == ""
     problem, sent = played(ONE.write_item(GAIN.name, GAIN.value), b"", wrong, b"", wrong, b"", wrong)
-    assert problem == "was given Position P Gain (84) = 900, but has 800"
+    assert problem == "has Position P Gain (84) = 800 after 900 was written"
     assert sent == [(WRITE, 84), (READ, 84)] * 3
 
 

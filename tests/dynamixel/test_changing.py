@@ -57,12 +57,12 @@ def test_a_change_of_the_address_that_did_not_happen_is_noticed():
     lose_the_write(rig)
     rig.refused(
         lambda one: one.change_id(5),
-        r"was given ID \(7\) = 5, but still answers under its old one",
+        r"still answers under its old ID after ID \(7\) = 5 was written",
     )
     lose_the_write(rig)
     rig.refused(
         lambda one: one.change_rate(1_000_000),
-        r"was given Baud Rate \(8\) = 3, but still answers at 57600 bit/s",
+        r"still answers at 57600 bit/s after Baud Rate \(8\) = 3 was written",
     )
     assert rig.one.read_items(["id", "baud_rate"]) == {"id": 1, "baud_rate": 1}
 
@@ -77,7 +77,7 @@ def test_another_servo_at_the_new_address_is_not_taken_for_it():
         rig.line.bus.servos[0].silence()
 
     rig.line.bus.after(5, swap)
-    rig.refused(lambda one: one.change_id(5), "the servo there is model number 1060, not 1020")
+    rig.refused(lambda one: one.change_id(5), "has model number 1060, not 1020")
 
 
 PROTOCOLS = [("AX-12A", 1.0), ("MX-64", 1.0), ("XM430-W350", 2.0), ("XL-320", 2.0)]
@@ -86,7 +86,7 @@ PROTOCOLS = [("AX-12A", 1.0), ("MX-64", 1.0), ("XM430-W350", 2.0), ("XL-320", 2.
 @pytest.mark.parametrize(("model", "protocol"), PROTOCOLS)
 def test_a_servo_gets_another_id_and_is_looked_for_there(model, protocol):
     rig = Rig(model, protocol)
-    assert rig.one.change_id(42) == "has ID 42; it had 1"
+    assert rig.one.change_id(42) == "has ID 42 (before: 1)"
     assert rig.servo.registers["id"] == 42
     assert rig.one.read_items(["id"]) == {"id": 42}
     assert rig.instructions().count(3) == 1  # EEPROM wears
@@ -101,7 +101,7 @@ def test_an_id_that_somebody_has_is_not_given():
 def test_a_lost_acknowledgement_of_an_id_decides_nothing():
     rig = Rig()
     rig.servo.poke("status_return_level", 1)
-    assert rig.one.change_id(5) == "has ID 5; it had 1"
+    assert rig.one.change_id(5) == "has ID 5 (before: 1)"
 
 
 @pytest.mark.parametrize(("model", "protocol"), PROTOCOLS)
@@ -109,7 +109,7 @@ def test_every_rate_of_the_table_can_be_set(model, protocol):
     rig = Rig(model, protocol)
     before = RATE
     for rate in rig.one.table.baud_rates.values():
-        assert rig.one.change_rate(rate) == f"runs at {rate} bit/s; before that, at {before}"
+        assert rig.one.change_rate(rate) == f"runs at {rate} bit/s (before: {before})"
         assert rig.servo.baud_rate == pytest.approx(rate, rel=0.03)
         before = rig.one.baud_rate
         assert before == rate
@@ -120,7 +120,7 @@ def test_a_rate_is_not_given_that_the_adapter_or_the_model_does_not_have_or_some
     rig.line.bus.servos[1].poke("baud_rate", 3)
     rig.line.bus.servos[1].poke("id", 1)
     rig.refused(lambda one: one.change_rate(4_500_000), "cannot run at 4500000 bit/s; nothing was changed")
-    with pytest.raises(InputError, match="has no rate of 12345 bit/s; it has 9600, "):
+    with pytest.raises(InputError, match="has no baud rate of 12345 bit/s; give one of 9600, "):
         rig.one.change_rate(12_345)
     rig.refused(lambda one: one.change_rate(1_000_000), "another servo has ID 1 at 1000000 bit/s")
     assert 3 not in rig.instructions()
@@ -136,10 +136,10 @@ def test_two_servos_of_one_id_are_not_dealt_with():
     ("model", "poked", "change", "said"),
     [
         ("AX-12A", {"lock": 1}, lambda one: one.change_id(7), r"has Lock \(47\) = 1"),
-        ("AX-12A", {}, OneServo.reboot, "knows no reboot"),
-        ("AX-12A", {}, OneServo.back_up, "no backup of their own"),
+        ("AX-12A", {}, OneServo.reboot, "has no reboot"),
+        ("AX-12A", {}, OneServo.back_up, "no internal backup"),
         ("XM430-W350", {}, OneServo.take_back, "refuses the restoring: result fail"),
-        ("XW540-T260", {}, lambda one: one.blink(1), "has no LED"),
+        ("XW540-T260", {}, lambda one: one.blink(1), "no switchable LED"),
     ],
 )
 def test_what_a_servo_cannot_do_is_refused_and_nothing_is_written(model, poked, change, said):
@@ -186,7 +186,7 @@ def test_a_reboot_is_waited_for():
 def test_a_servo_that_does_not_come_back_is_missed():
     rig = Rig()
     rig.servo.boot_ns = 60_000_000_000
-    rig.refused(OneServo.reboot, "does not answer since 5 s; look for it: dxlrun scan")
+    rig.refused(OneServo.reboot, "has not answered for 5 s; find it with `dxlrun scan")
 
 
 def test_a_reboot_that_did_not_happen_is_noticed():
@@ -211,7 +211,7 @@ def test_a_factory_reset_keeps_what_it_shall(keep, address):
     rig.one.change_id(9)
     rig.one.change_rate(1_000_000)
     said = rig.one.factory_reset(keep)
-    assert said == f"has the factory's values, ID {address[0]} at {address[1]} bit/s"
+    assert said == f"has the factory values, ID {address[0]} at {address[1]} bit/s"
     assert (rig.servo.registers["id"], rig.servo.baud_rate) == address
     assert rig.servo.registers["return_delay_time"] == 250
 
@@ -219,7 +219,7 @@ def test_a_factory_reset_keeps_what_it_shall(keep, address):
 def test_a_factory_reset_of_protocol_1_keeps_nothing():
     rig = Rig("AX-12A", 1.0)
     rig.one.change_id(9)
-    assert rig.one.factory_reset(Reset.ALL) == "has the factory's values, ID 1 at 1000000 bit/s"
+    assert rig.one.factory_reset(Reset.ALL) == "has the factory values, ID 1 at 1000000 bit/s"
 
 
 def test_a_factory_reset_beside_a_servo_as_shipped_is_refused():
@@ -233,7 +233,7 @@ def test_a_factory_reset_beside_a_servo_as_shipped_is_refused():
 def test_a_servo_keeps_and_takes_back_its_own_backup():
     rig = Rig()
     rig.one.write_registers([rig.one.register("return_delay_time", 7)])
-    assert rig.one.back_up() == "stored its control table in its own backup"
+    assert rig.one.back_up() == "stored its control table in its internal backup"
     rig.one.write_registers([rig.one.register("return_delay_time", 9)])
     rig.one.take_back()
     assert rig.servo.registers["return_delay_time"] == 7
@@ -243,7 +243,7 @@ def test_a_servo_keeps_and_takes_back_its_own_backup():
 def test_torque_comes_where_the_servo_stands(model, protocol):
     rig = Rig(model, protocol)
     before = rig.servo.shaft_angle
-    assert "holds torque in position mode at tick" in rig.one.torque(True)[0]
+    assert "holds torque in position mode at its present tick" in rig.one.torque(True)[0]
     rig.wait()
     assert rig.servo.torque_on
     assert rig.servo.shaft_angle == pytest.approx(before, abs=0.01)
@@ -307,10 +307,8 @@ def test_the_backup_of_every_model_fits_that_model_and_heals_it(tmp_path, protoc
         assert all(rig.servo.registers[each.name] == each.value for each in changed)
 
 
-TRIPPED = (
-    "cleared Bus Watchdog (98), which was 255 (tripped): it had stopped the servo, as no instruction came"
-)
-STOOD = "holds torque in position mode at tick 1304, where it stood"
+TRIPPED = "cleared Bus Watchdog (98) = 255 (tripped): it had stopped the servo"
+STOOD = "holds torque in position mode at its present tick 1304"
 
 
 def trip(rig, torque):
@@ -334,7 +332,7 @@ def test_torque_on_clears_a_tripped_bus_watchdog_and_holds_where_the_servo_stand
 def test_torque_on_clears_a_bus_watchdog_that_would_trip():
     rig = Rig()
     rig.servo.poke("bus_watchdog", 10)
-    armed = "cleared Bus Watchdog (98), which was 10: it would have stopped the servo after 200 ms without"
+    armed = "cleared Bus Watchdog (98) = 10: it would have stopped the servo after 200 ms without"
     done = rig.one.torque(True)
     assert done == (f"{armed} an instruction", STOOD)
     rig.servo.poke("bus_watchdog", 10)
@@ -403,7 +401,7 @@ def test_a_bus_watchdog_that_cannot_be_cleared_is_named_and_gets_no_torque():
     rig = Rig()
     trip(rig, 0)
     rig.servo.registers.watch_items(("bus_watchdog",), lambda: rig.servo.poke("bus_watchdog", -1))
-    with pytest.raises(ServoFault, match=r"was given Bus Watchdog \(98\) = 0, but has 255"):
+    with pytest.raises(ServoFault, match=r"has Bus Watchdog \(98\) = 255 after 0 was written"):
         rig.one.torque(True)
     assert not rig.servo.torque_on
 

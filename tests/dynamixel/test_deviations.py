@@ -269,8 +269,12 @@ def test_a_speed_that_is_harmless_is_written_with_each_goal(table):
 @pytest.mark.parametrize(
     ("name", "value", "sentence"),
     [
-        ("secondary_shadow_id", 2, "has Secondary (Shadow) ID (12) = 2, which makes it also execute what is"),
-        ("shutdown", 0, "has Shutdown (63) = 0, which leaves its torque on whatever the error"),
+        (
+            "secondary_shadow_id",
+            2,
+            "has Secondary (Shadow) ID (12) = 2, and this value makes it also execute what is",
+        ),
+        ("shutdown", 0, "has Shutdown (63) = 0, and this value leaves its torque on whatever the error"),
     ],
 )
 def test_a_refused_setting_comes_with_the_command_that_writes_it_on_a_real_port_alone(name, value, sentence):
@@ -288,7 +292,7 @@ def test_a_refused_setting_comes_with_the_command_that_writes_it_on_a_real_port_
         (problem,) = found.problems
         assert problem.startswith(f"arm_4_joint (ID 4 on bus arm) {sentence}")
         link = help_link("a-setting-of-another-program-is-refused")
-        assert problem.endswith(f": write {factory} there{command}; {link}")
+        assert problem.endswith(f": write {factory}{command}; {link}")
 
 
 def plan_item(plan: BusPlan, name: str) -> ControlItem:
@@ -310,7 +314,7 @@ def test_all_settings_of_a_servo_are_one_event():
     ((joint, text),) = rig.events.of(EventCode.REGISTER_DIFFERS)
     assert joint == "arm_5_joint"
     assert text.startswith(
-        "ID 5 on bus arm differs from the factory's settings: PWM Limit (36) = 400 instead of 885"
+        "ID 5 on bus arm differs from the factory settings: PWM Limit (36) = 400 instead of 885"
     )
     assert all(plan_item(rig.plans[0], name).title in text for name in left)
 

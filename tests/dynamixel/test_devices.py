@@ -202,9 +202,7 @@ def test_a_device_that_answers_only_alone_is_read_alone(monkeypatch, fast):
     assert rig.sources.values[0] == 29
     ((source, text),) = rig.events.of(EventCode.SETUP)[-1:]
     assert source == "device_0"
-    assert text.endswith(
-        "answers single reads, but no reads together with others; it is read alone from now on"
-    )
+    assert text.endswith("does not answer combined reads; it is read alone from now on")
     assert len(rig.events.of(EventCode.READ_LOST)) <= 2  # its silence may silence the one behind it once
 
 
@@ -337,9 +335,9 @@ def test_a_device_of_another_model_or_none_at_all_ends_the_start_with_a_sentence
     with pytest.raises(StartUpError) as caught:
         hardware.start()
     assert str(caught.value).splitlines() == [
-        "device_0 (ID 101 on bus main) answers with model number 1060, which is that of XL430-W250, and that "
-        "of generic is 65000: correct `model` or the ID",
-        "device_1 (ID 102 on bus main) does not answer: check its ID, and that it runs at 1000000 bit/s",
+        "device_0 (ID 101 on bus main) has model number 1060 (XL430-W250), not 65000 (generic): "
+        "correct `model` or the ID",
+        "device_1 (ID 102 on bus main) does not answer: check its ID and baud rate (1000000 bit/s)",
     ]
 
 

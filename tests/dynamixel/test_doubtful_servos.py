@@ -41,8 +41,8 @@ def test_a_joint_that_forgot_its_turns_over_a_reboot_does_not_wind_them_up_again
     )
     assert rig.torque() == [False, True]
     (text,) = rig.events.texts(EventCode.SERVO_LIMP)
-    assert "lost its count of turns" in text
-    assert "`dxlrun torque on main_1_joint` gives it torque" in text
+    assert "lost its turn count" in text
+    assert "switch its torque on with `dxlrun torque on main_1_joint`" in text
     assert rig.events.of(EventCode.IMPLAUSIBLE) == [], "its position is another one for a known reason"
     rig.hardware.switch_torque(0, True)
     rig.cycles(20)
@@ -140,7 +140,7 @@ def test_wheels_of_a_robot_that_is_left_with_torque_by_a_loop_that_died_stand(mo
     rig.servo(2).poke("torque_enable", 0)
     rig.hardware.read_states()  # and the loop dies
     said = stand(rig.lines)
-    assert said == ("main_1_joint (ID 1 on bus main) stands: its goal is 0",)
+    assert said == ("main_1_joint (ID 1 on bus main) was stopped: its goal is 0",)
     rig.clock.wait_until(rig.clock.now_ns() + 500_000_000)
     assert rig.torque() == [True, False], "a servo without torque was given some"
     standing = rig.servo(1).shaft_angle
@@ -155,7 +155,7 @@ def test_a_wheel_that_takes_no_goal_any_more_loses_its_torque_when_the_loop_died
     rig.cycles(20)
     rig.servo(1).poke("bus_watchdog", -1)
     said = stand(rig.lines)
-    assert "is limp, as did not acknowledge its goal" in said[0]
+    assert "could not be stopped and is limp: did not acknowledge its goal" in said[0]
     assert rig.torque() == [False, True]
 
 
@@ -175,7 +175,7 @@ def test_a_wheel_whose_torque_off_was_lost_is_tried_again():
     rig.ports.ports[0].write_packet = lose_the_first
     said = stand(rig.lines)
     assert lost
-    assert "main_1_joint (ID 1 on bus main) is limp, as " in said[-1]
+    assert "main_1_joint (ID 1 on bus main) could not be stopped and is limp: " in said[-1]
     assert rig.torque()[0] is False
 
 

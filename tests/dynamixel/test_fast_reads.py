@@ -110,10 +110,10 @@ def test_servos_of_old_firmware_are_read_plainly_and_it_is_told():
     assert rig.states.valid.all()
     ((_, severity, _, text),) = [e for e in rig.events.list if e[1] is Severity.WARNING]
     assert severity is Severity.WARNING
-    assert "needs firmware 45" in text
+    assert "they need firmware 45" in text
     assert "arm_13_joint (ID 13 on bus arm) has 44" in text
     assert "arm_17_joint (ID 17 on bus arm) has 44" in text
-    assert "2.76 ms instead of 2.28 ms, at most 362 Hz" in text
+    assert "2.76 ms instead of 2.28 ms (at most 362 Hz)" in text
 
 
 def test_models_of_two_layouts_are_read_by_one_fast_bulk_read():

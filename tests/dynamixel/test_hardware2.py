@@ -97,7 +97,9 @@ def test_no_model_starts_that_would_switch_its_torque_on_by_itself(model):
         make_plan((5,), protocol=2.0, model=model, reference=1.5, lower=-0.1, upper=0.1), position=1.5
     )
     rig.servo(5).poke("startup_configuration", 1)
-    with pytest.raises(StartUpError, match=r"Startup Configuration \(\d+\) = 1, which switches its torque"):
+    with pytest.raises(
+        StartUpError, match=r"Startup Configuration \(\d+\) = 1, and this value switches its torque"
+    ):
         rig.hardware.start()
     assert rig.torque() == [False]
 
@@ -124,8 +126,8 @@ def test_a_declared_register_that_older_firmware_does_not_have_is_refused():
         rig.hardware.start()
     assert [packet for packet in rig.into_bus() if packet[7] not in (1, 2)] == []
     assert str(caught.value).splitlines()[1] == (
-        "arm_12_joint (ID 12 on bus arm) has firmware 44, but Startup Configuration (60), which the robot "
-        "file declares, came with firmware 45: remove it from `registers`, or update the servo"
+        "arm_12_joint (ID 12 on bus arm) has firmware 44, but `registers` in the robot file has Startup "
+        "Configuration (60), available from firmware 45: remove it, or update the servo"
     )
 
 

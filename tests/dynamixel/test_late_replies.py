@@ -63,8 +63,8 @@ ODD = {
 }
 """Settings that a start reports, each with a value of its own."""
 SILENT = re.compile(
-    r"(did|does|do) not (answer|come back|confirm|acknowledge)|answers only|garbled|missed|none of the|"
-    r"belonged to no packet|is probed once a second|answers again$|(reply was|replies in a row were) lost"
+    r"(did|does|do) not (answer|confirm|acknowledge|belong)|no longer answers|answers only|garbled|missed|"
+    r"none of the|is probed once a second|answers again$|(reply was|replies in a row were) lost"
 )
 
 TORQUE_OFF = {"hardware: torque is off on the servo", "torque was switched off again on every servo"}
@@ -133,7 +133,7 @@ def look_again(protocol: float, faults: Faults) -> tuple[set[str], int]:
     before = len(rig.events.list)
     replies = disturb_replies(rig.buses[0], 1, faults)
     rig.cycles(120)
-    found = {re.sub(r"^.*cannot take part: ", "", text) for text in texts(rig.events.list[before:])}
+    found = {re.sub(r"^.*is not ready: ", "", text) for text in texts(rig.events.list[before:])}
     return reported(found), replies()
 
 

@@ -122,9 +122,11 @@ def test_replies_later_than_planned_are_reported_before_any_servo_has_torque(tmp
         robot.run()
     assert refusal.value.for_replies
     (sentence,) = refusal.value.sentences
-    start = r"the loop would miss most replies: (\d+) of \1 replies on bus main came up to 1[56] ms later"
+    start = (
+        r"the loop would miss most replies: (\d+) of \1 replies on bus main were delayed by up to 1[56] ms"
+    )
     assert re.match(start, sentence), sentence
-    assert sentence.endswith(" wire needs, and 1 ms were planned for the adapter"), "nothing shows the cause"
+    assert sentence.endswith(" (planned for the adapter: 1 ms)"), "nothing shows the cause"
     torque_on = bytes.fromhex("0318")  # a write to Torque Enable (24)
     assert not any(torque_on in entry.data for entry in robot.ledger.entries if entry.direction == "in")
 
@@ -184,6 +186,6 @@ def test_late_start_names_the_timer_that_the_kernel_shows(tmp_path, found_ms, na
         place.write_text(f"{found_ms}\n")
     sentence = describe_late_start("main", "/dev/ttyUSB7", [15 * MS, 0, 14 * MS], MS, tmp_path)
     assert sentence.startswith(
-        "2 of 3 replies on bus main came up to 15 ms later than the wire needs, and 1 ms"
+        "2 of 3 replies on bus main were delayed by up to 15 ms (planned for the adapter: 1 ms)"
     )
-    assert ("its latency timer is 16 ms: `echo 1 | sudo tee" in sentence) is named
+    assert ("the adapter's latency timer is 16 ms: shorten it with `echo 1 | sudo tee" in sentence) is named

@@ -55,7 +55,7 @@ def test_another_host_that_asks_between_the_exchanges_leaves_an_event(way, heard
         rig.cycle()
     ((source, text),) = told(rig)
     assert source == "main"
-    assert text.startswith("2 packets on bus main answer no request of this run: another program or")
+    assert text.startswith("2 unrequested packets on bus main: another program or")
     assert rig.packets.received() == rig.out_of_bus()
     assert rig.states.valid.all()
     assert rig.torque() == [True] * 4

@@ -93,9 +93,9 @@ def test_a_table_is_taken_as_a_path_or_as_a_text(
     [
         ('"model = 1"', "does not return a list from dxlrun_servo_models"),
         ("[5]", "offers the servo model 5; it must be a TOML text or the path of a file"),
-        ('[Path("/nowhere.toml")]', "a servo model (/nowhere.toml) that cannot be used (FileNotFoundError"),
-        ('["model = "]', "that cannot be used (TOMLDecodeError"),
-        ('["model = 1"]', "that cannot be used (ValueError: the entry 'items' is missing)"),
+        ('[Path("/nowhere.toml")]', "an unusable servo model (/nowhere.toml) (FileNotFoundError"),
+        ('["model = "]', "an unusable servo model (TOMLDecodeError"),
+        ('["model = 1"]', "an unusable servo model (ValueError: the entry 'items' is missing)"),
         ("[TAKEN]", "is already used by the AX-12A"),
     ],
 )  # fmt: skip

@@ -137,7 +137,7 @@ def test_rates_that_the_adapter_cannot_are_left_out_and_reported():
 @pytest.mark.parametrize("ids", [(), (1, 2)])
 def test_an_adapter_that_echoes_is_refused(protocol, ids):
     line = VirtualLine(protocol=protocol, adapter=AdapterConfig(echo=True))
-    with pytest.raises(PortError, match="echoes what it sends"):
+    with pytest.raises(PortError, match="echoes every instruction"):
         scan(ToolLine(line), Search((protocol,), (57_600,), ids))
 
 

@@ -75,7 +75,7 @@ def test_a_servo_that_is_silent_for_a_moment_gets_its_register(started):
 def test_nothing_else_than_ram_is_written_whatever_comes_out_of_the_mailbox(started, item):
     answers = []
     started.hardware.write_register(0, item, 60, keep(answers))
-    assert answers == [f"arm_11_joint has no register {item} that could be written now"]
+    assert answers == [f"arm_11_joint has no writable RAM register {item}"]
 
 
 def test_many_requests_are_done_in_their_order_and_no_cycle_is_late(started):

@@ -179,7 +179,7 @@ def test_torque_off_that_was_not_heard_is_written_again_and_one_that_is_never_he
     assert arm.rig.torque() == [True, False, True]
     arm = Arm().start()
     arm.rig.stick(12, "torque_enable", 1)
-    assert arm.told(arm.switch(False)).endswith("did not confirm torque off; it is tried again")
+    assert arm.told(arm.switch(False)).endswith("did not confirm torque off; dxlrun sends it again")
 
 
 def test_off_and_on_twice_is_off_and_on():
@@ -276,7 +276,7 @@ def test_torque_on_a_servo_of_protocol_1_that_shut_down_says_what_helps():
     assert "(ID 12 on bus arm)" in problem
     assert "switch its power off and on" in problem
     assert "reboot" not in problem
-    assert "knows no reboot instruction: switch its power off and on" in arm.told(arm.reboot())
+    assert "has no reboot instruction: switch its power off and on" in arm.told(arm.reboot())
 
 
 @pytest.mark.parametrize("watchdog", [0, 10])
@@ -353,7 +353,7 @@ def test_a_servo_that_does_not_come_back_is_named_after_three_seconds():
     arm.follow(2)
     arm.servo.silence()
     problem = arm.told(number)
-    assert problem.startswith("arm_12_joint (ID 12 on bus arm) did not come back within 3 s after its reboot")
+    assert problem.startswith("arm_12_joint (ID 12 on bus arm) did not answer within 3 s after its reboot")
     arm.servo.silence(False)
     arm.follow(120)
     assert arm.rig.states.valid.all()
@@ -374,7 +374,9 @@ def test_a_servo_that_is_lost_is_limp_when_it_is_back_after_torque_off():
     arm = Arm(returning=True).start()
     arm.servo.silence()
     arm.rig.cycles(30)
-    assert arm.told(arm.switch(False)).endswith("does not answer: its torque stays off when it is back")
+    assert arm.told(arm.switch(False)).endswith(
+        "does not answer; dxlrun switches its torque off when it is back"
+    )
     arm.servo.silence(False)
     arm.follow(120)
     assert arm.rig.torque() == [True, False, True]
@@ -388,7 +390,9 @@ def test_a_lost_servo_without_torque_stays_limp_after_torque_off_though_it_reboo
     assert arm.shown[1] is Torque.OFF
     arm.servo.silence()
     arm.rig.cycles(30)
-    assert arm.told(arm.switch(False)).endswith("does not answer: its torque stays off when it is back")
+    assert arm.told(arm.switch(False)).endswith(
+        "does not answer; dxlrun switches its torque off when it is back"
+    )
     begun = len(arm.rig.into_bus())
     arm.servo.reboot()
     arm.servo.silence(False)
@@ -446,7 +450,7 @@ def test_a_servo_that_reboots_while_it_is_checked_gets_no_torque():
         begun = len(arm.rig.into_bus())
         number = arm.switch(True)
         arm.rig.buses[0].after(packets, arm.servo.power_cycle)
-        assert "rebooted while it was checked" in arm.told(number), packets
+        assert "rebooted during the check" in arm.told(number), packets
         assert (12, 1) not in arm.torque_bytes(begun)
         arm.follow(100)
         assert not any(given)
@@ -513,7 +517,7 @@ def test_twenty_joints_at_once():
 
 @pytest.mark.parametrize(
     ("item", "said"),
-    [("torque_enable", "was given goal "), ("bus_watchdog", "was given Bus Watchdog (98) = 10, but has 0")],
+    [("torque_enable", "has goal "), ("bus_watchdog", "has Bus Watchdog (98) = 0 after 10 was written")],
 )
 def test_a_servo_that_does_not_take_torque_or_its_watchdog_is_limp_and_named(item, said):
     arm = Arm(watchdog=10).let_go()

@@ -82,7 +82,7 @@ def test_new_servos_get_id_rate_and_registers_and_are_compared(bench: Bench) -> 
     assert bench.servo(0) == (5, 3, 10, 70)
     assert bench.servo(1) == (1, 3, 10, 80)
     assert bench.line.bus.servos[1].registers["position_p_gain"] != 700  # RAM: each run writes it
-    assert "elbow: has ID 5; it had 1" in script.text
+    assert "elbow: has ID 5 (before: 1)" in script.text
     assert "Bus main: 2 servos match the robot file." in script.text
     again = Bench.do(
         bench,
@@ -168,7 +168,7 @@ def test_what_changed_again_is_found_at_the_end(bench: Bench) -> None:
     script = bench.do(("for elbow", bench.connect(0)), ("all", spoiled), ("again?", "n"), joints=("elbow",))
     assert bench.code == 1
     assert "elbow (ID 5 on bus main) has Temperature Limit (31) = 60, not 70" in script.text
-    assert "Homing Offset (20) = 5, which shifts every position" in script.text
+    assert "Homing Offset (20) = 5, and this value shifts every position" in script.text
 
 
 def test_a_servo_that_dies_in_the_middle_is_set_up_again(
@@ -374,4 +374,4 @@ def test_a_servo_of_another_robot_gets_the_settings_of_the_factory_that_no_run_s
     names = ("secondary_shadow_id", "homing_offset", "pwm_limit")
     assert [wrist.registers[name] for name in names] == [255, 0, 500]
     assert "wrist: Secondary (Shadow) ID (12) was changed from 2 to 255" in script.text
-    assert "wrist: ID 1 on bus main differs from the factory's settings: PWM Limit (36) = 500" in script.text
+    assert "wrist: ID 1 on bus main differs from the factory settings: PWM Limit (36) = 500" in script.text

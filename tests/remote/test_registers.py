@@ -61,7 +61,7 @@ def test_a_servos_failure_is_the_answer(arm):
     ("path", "body", "status", "said"),
     [
         ("/joints/pen/registers/led", {"value": 1}, 404, "there is no joint pen; did you mean pan?"),
-        ("/joints/pan/registers/lad", {"value": 1}, 404, "pan: an XM430-W350 has no register lad; did you mean led?"),
+        ("/joints/pan/registers/lad", {"value": 1}, 404, "pan: XM430-W350 has no register lad; did you mean led?"),
         (GAIN, {"value": 20_000}, 422, "pan: Position P Gain (84) of an XM430-W350 is 0..16383, not 20000"),
         (GAIN, {"value": "5 V"}, 422, "pan: Position P Gain (84) has no unit, but is '5 V'"),
         ("/joints/pan/registers/profile_acceleration", {"value": "5 V"}, 422, "profile_acceleration of pan: '5 V' has the unit V"),
@@ -155,7 +155,7 @@ def test_what_cannot_be_switched_does_not_reach_the_loop(arm, path, body, status
     [
         ("/joints/pen", "there is no joint pen; did you mean pan?"),
         ("/joints/pen/registers/led", "there is no joint pen; did you mean pan?"),
-        ("/joints/pan/registers/lad", "pan: an XM430-W350 has no register lad; did you mean led?"),
+        ("/joints/pan/registers/lad", "pan: XM430-W350 has no register lad; did you mean led?"),
         ("/joints/pan/registers/nonsense", "`dxlrun models XM430-W350` lists them"),
     ],
 )

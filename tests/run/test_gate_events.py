@@ -32,8 +32,8 @@ def test_an_effort_that_presses_a_joint_against_its_limit_has_one_event_and_one_
     texts = [
         event.text
         for event in log.events
-        if event.code == EventCode.GATE and "out of the position limits" in event.text
+        if event.code == EventCode.GATE and "at the position limit" in event.text
     ]
     assert len(texts) == 2
-    assert texts[0] == "g, controller arm: goal stopped: it leads out of the position limits"
-    assert texts[1].startswith("g: goal stopped: it leads out of the position limits; this ended after ")
+    assert texts[0] == "g, controller arm: goal stopped at the position limit"
+    assert texts[1].startswith("g: goal stopped at the position limit; this ended after ")

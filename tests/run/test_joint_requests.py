@@ -152,7 +152,7 @@ def test_a_joint_that_starts_limp_never_has_torque_until_it_is_asked_for(run):
     log = one.run()
     assert at == [0]
     assert 1 in given
-    refused = "elbow (ID 2 on bus main) is limp; `dxlrun torque on elbow` gives it torque"
+    refused = "elbow (ID 2 on bus main) is limp; switch torque on with `dxlrun torque on elbow`"
     assert one.answer(switch).text == refused  # type: ignore[union-attr]
     assert isinstance(one.answer(on), Completion)
     assert isinstance(one.answer(again), Completion)
@@ -249,7 +249,7 @@ def test_a_reboot_that_never_ends_is_a_loss(run):
     log = one.run()
     answer = one.answer(reboot)
     assert isinstance(answer, Refusal)
-    assert answer.text.startswith("wrist (ID 3 on bus main) did not come back within 3 s after its reboot")
+    assert answer.text.startswith("wrist (ID 3 on bus main) did not answer within 3 s after its reboot")
     assert one.torque(log, 2)[:3] == [Torque.ON, Torque.REBOOTING, Torque.LOST]
     totals = totals_of(one.path)
     assert 140 < totals.invalid[2] < 180  # of the end, not of the three seconds before

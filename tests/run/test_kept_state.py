@@ -151,7 +151,7 @@ def test_a_state_goes_from_run_to_run_and_a_replay_begins_with_it(robot, tmp_pat
     assert number(run(robot, kept, log)) == 3
     ((severity, text),) = said(log)
     assert severity == Severity.INFO
-    assert text == f"starts with the 20008 bytes of its kept state ({kept}/runs.kept)"
+    assert text == f"starts with its kept state of 20008 bytes ({kept}/runs.kept)"
     (kept / "runs.kept").unlink()  # the replay has what it needs in the log
     report = replay_log(log)
     assert report.same, report

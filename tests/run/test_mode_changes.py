@@ -89,7 +89,7 @@ def test_the_log_has_what_was_waited_for(log: Log) -> None:
     waits = [
         event.source
         for event in log.events
-        if event.code == EventCode.MODE and event.text == "waits until its joints are in their modes"
+        if event.code == EventCode.MODE and event.text == "waits for the mode changes of its joints"
     ]
     assert waits == ["pull", "push", "turn", "grip"]
 

@@ -178,7 +178,7 @@ def test_a_guardian_that_leaves_torque_on_stops_what_is_led_by_a_velocity(safe_s
     wheel = robot.buses[0].servo(1)
     assert wheel.registers["goal_velocity"] > 0
     said = safe_stop.apply_final_state((), "it died", texts.loop_failed)
-    assert said == ["it died", TORQUE_STAYS, "left (ID 1 on bus main) stands: its goal is 0"]
+    assert said == ["it died", TORQUE_STAYS, "left (ID 1 on bus main) was stopped: its goal is 0"]
     assert wheel.registers["goal_velocity"] == 0
     assert [servo.torque_on for servo in robot.buses[0].servos] == [True, True]
 

@@ -39,7 +39,7 @@ class Findings(msgspec.Struct):
         events: list[tuple[str, EventBody]] = []
         for joint, place in dict.fromkeys((joint, place) for joint, place, _ in self.deviations):
             own = [each for _, where, each in self.deviations if where == place]
-            named = "; ".join(f"{each.text}, which {each.effect}" for each in own[:_MOST_NAMED])
+            named = "; ".join(f"{each.text} ({each.effect})" for each in own[:_MOST_NAMED])
             if len(own) > _MOST_NAMED:
                 named += f"; {len(own) - _MOST_NAMED} more, see `dxlrun check ROBOT.yaml --online`"
             remedies: dict[str, list[str]] = {}

@@ -15,7 +15,7 @@ from dxlwire.exceptions import counted, help_link
 from dxlwire.port.latency_timer import SYSTEM, fix, is_simulated, is_timer, latency_timer
 
 CHECK = "check its cable and power"
-INJECTED = "look at the faults that were injected into the simulation"
+INJECTED = "check the faults injected into the simulation"
 _IDLE = MachineLoad()
 
 
@@ -32,7 +32,7 @@ def choose_remedy(
 
     Example:
         >>> choose_remedy("sim", "check its cable and power")
-        'look at the faults that were injected into the simulation'
+        'check the faults injected into the simulation'
     """
     if load.too_busy:
         return free_machine((port,))
@@ -63,8 +63,8 @@ def late_replies(
         load: Load of the machine at that time, as far as it is known.
     """
     observed = (
-        f"replies on bus {bus} come {extra_ns / 1e6:.1f} ms later than the wire needs, and "
-        f"{planned_ns / 1e6:g} ms were planned for the adapter"
+        f"replies on bus {bus} are delayed by {extra_ns / 1e6:.1f} ms (planned for the adapter: "
+        f"{planned_ns / 1e6:g} ms)"
     )
     if load.too_busy:
         return observed, choose_remedy(port, "", load=load)
@@ -73,7 +73,7 @@ def late_replies(
     name = Path(port).name
     device = name if name.startswith("ttyUSB") else f"$(basename $(readlink -f {port}))"
     command = fix(f"/sys/bus/usb-serial/devices/{device}/latency_timer")
-    return f"{observed}: that is a latency timer of 16 ms", f"`{command}` shortens it"
+    return f"{observed}, probably by a latency timer of 16 ms", f"`{command}` shortens it"
 
 
 def describe_late_start(
@@ -94,11 +94,12 @@ def describe_late_start(
     late = [each for each in late_ns if each > planned_ns]
     total, most_ms = counted(len(late_ns), "reply", "replies"), max(late, default=0) / 1e6
     observed = (
-        f"{len(late)} of {total} on bus {bus} came up to {most_ms:.0f} ms later than the wire needs, and "
-        f"{planned_ns / 1e6:g} ms were planned for the adapter"
+        f"{len(late)} of {total} on bus {bus} were delayed by up to {most_ms:.0f} ms (planned for the "
+        f"adapter: {planned_ns / 1e6:g} ms)"
     )
     timer = None if is_simulated(port) else latency_timer(port, system)
     if timer is None or timer.found_ms * 1_000_000 <= planned_ns:
         return observed
     link = help_link("replies-come-late")
-    return f"{observed}; its latency timer is {timer.found_ms} ms: `{timer.fix}` shortens it; {link}"
+    timed = f"the adapter's latency timer is {timer.found_ms} ms: shorten it with `{timer.fix}`"
+    return f"{observed}; {timed}; {link}"

@@ -27,16 +27,16 @@ def torque_limit_restored(register: str, before: int, now: int) -> str:
 @event_text(EventCode.SETUP, Severity.WARNING)
 def fast_reads_refused(bus: str, refusals: str, total_ns: int, planned_ns: int) -> str:
     return (
-        f"bus {bus} is read without fast reads: {refusals}; a cycle takes {total_ns / 1e6:.2f} ms instead of "
-        f"{planned_ns / 1e6:.2f} ms, at most {1e9 / total_ns:.0f} Hz"
+        f"bus {bus} does not use fast reads: {refusals}; a cycle takes {total_ns / 1e6:.2f} ms instead of "
+        f"{planned_ns / 1e6:.2f} ms (at most {1e9 / total_ns:.0f} Hz)"
     )
 
 
 @event_text(EventCode.SETUP, Severity.WARNING)
 def fast_reads_given_up(bus: str, count: int, servos: str) -> str:
     return (
-        f"bus {bus}: {count} fast reads in a row stayed incomplete, so {servos} are read without fast reads "
-        "from now on: does one of them have another firmware, or a loose contact?"
+        f"bus {bus}: {count} fast reads in a row were incomplete; plain reads are used for {servos}: check "
+        "their firmware and contacts"
     )
 
 
@@ -52,7 +52,7 @@ def torque_is_on(joints: str) -> str:
 
 @event_text(EventCode.TORQUE_OFF, Severity.INFO)
 def joints_start_limp(joints: str) -> str:
-    return f"limp by `torque: off` in the robot file: {joints}"
+    return f"torque stays off because of `torque: off` in the robot file: {joints}"
 
 
 # Registers
@@ -80,14 +80,14 @@ def register_not_written(problem: str) -> str:
 
 @event_text(EventCode.REGISTER_DIFFERS, Severity.WARNING)
 def settings_differ(servo: str, settings: str, remedies: str) -> str:
-    return f"{servo} differs from the factory's settings: {settings}; {remedies}"
+    return f"{servo} differs from the factory settings: {settings}; {remedies}"
 
 
 @event_text(EventCode.SERVO_HOT, Severity.WARNING)
 def servo_hot(servo: str, celsius: float, register: str, limit: float) -> str:
     return (
-        f"{servo} is at {celsius:.0f} deg C; it cuts its torque above its {register}, {limit:.0f} deg C: "
-        "let it rest"
+        f"{servo} is at {celsius:.0f} deg C and cuts its torque above {limit:.0f} deg C ({register}): "
+        "reduce its load"
     )
 
 
@@ -130,15 +130,15 @@ def servo_unfit(servo: str, problems: Sequence[str]) -> str:
 
 
 def unfit_clause(problems: Sequence[str]) -> str:
-    """Return the clause `answers again, but cannot take part: ...` with the problems of a servo that stays
+    """Return the clause `answers again, but is not ready: ...` with the problems of a servo that stays
     lost.
     """
-    return f"answers again, but cannot take part: it {'; it '.join(problems)}"
+    return f"answers again, but is not ready: it {'; it '.join(problems)}"
 
 
 @event_text(EventCode.SERVO_BACK, Severity.INFO)
 def servo_back_limp(servo: str) -> str:
-    return f"{servo} is back, limp: it gets no goals"
+    return f"{servo} is back and limp: it gets no goals"
 
 
 @event_text(EventCode.SERVO_BACK, Severity.INFO)
@@ -158,14 +158,14 @@ def servo_rebooted_on_request(servo: str) -> str:
 
 @event_text(EventCode.SERVO_REBOOTED, Severity.ERROR)
 def servo_rebooted(servo: str) -> str:
-    return f"{servo} rebooted: it was without power, or another program rebooted it"
+    return f"{servo} rebooted: it lost power, or another program rebooted it"
 
 
 @event_text(EventCode.SERVO_REBOOTED, Severity.ERROR)
 def servo_reboots_repeatedly(servo: str, remedy: str) -> str:
     return (
-        f"{servo} rebooted for the second time within a minute, so no policy gives it torque again: it was "
-        f"without power, or another program rebooted it: {remedy}"
+        f"{servo} rebooted twice within a minute and stays limp; it lost power, or another program rebooted "
+        f"it: {remedy}"
     )
 
 
@@ -202,20 +202,20 @@ def torque_lost(servo: str, address: int | None, value: int) -> str:
 
 @event_text(EventCode.SERVO_LIMP, Severity.ERROR)
 def servo_shut_down(servo: str, register: str) -> str:
-    return f"{servo} has {register} = 0: it shut down, and gets no goals until the next run"
+    return f"{servo} has {register} = 0: it shut down; it gets no goals until the next run"
 
 
 @event_text(EventCode.SERVO_LIMP, Severity.ERROR)
 def turns_lost(servo: str, joint: str) -> str:
     return (
-        f"{servo} lost its count of turns in a reboot, so it stays limp and counts from its present "
-        f"position; `dxlrun torque on {joint}` gives it torque"
+        f"{servo} lost its turn count in a reboot: it stays limp and counts from its present position; "
+        f"switch its torque on with `dxlrun torque on {joint}`"
     )
 
 
 @event_text(EventCode.TORQUE_ON, Severity.INFO)
 def torque_on_as_requested(servo: str) -> str:
-    return f"{servo} has torque, as requested: it holds where it is"
+    return f"{servo} has torque, as requested, and holds its position"
 
 
 @event_text(EventCode.TORQUE_ON, Severity.WARNING)
@@ -255,7 +255,7 @@ def output_not_made_safe(problem: str) -> str:
 def watchdog_stopped_servos(silent_ms: int) -> str:
     return (
         f"no instruction for {silent_ms} ms: the Bus Watchdog has stopped the servos; "
-        "they are being enabled again"
+        "dxlrun enables them again"
     )
 
 
@@ -279,19 +279,19 @@ def line_lost(error: str) -> str:
 
 @event_text(EventCode.PORT_BACK, Severity.WARNING)
 def line_back(bus: str) -> str:
-    return f"bus {bus} is back; its servos are treated as rebooted"
+    return f"bus {bus} is back; its servos are checked as after a reboot"
 
 
 @event_text(EventCode.BUS_NOISE, Severity.WARNING)
 def noise_received(count: int) -> str:
-    return f"{counted(count, 'byte', 'bytes')} belonged to no packet"
+    return f"{counted(count, 'byte', 'bytes')} did not belong to a packet"
 
 
 @event_text(EventCode.UNREQUESTED, Severity.WARNING)
 def other_host_found(bus: str, packets: int) -> str:
     return (
-        f"{packets} packets on bus {bus} answer no request of this run: another program or another "
-        "computer writes on the line; stop it, or its commands move these servos too"
+        f"{packets} unrequested packets on bus {bus}: another program or computer sends on this line; "
+        "stop it, or its commands move these servos too"
     )
 
 

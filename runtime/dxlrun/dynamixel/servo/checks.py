@@ -94,8 +94,8 @@ def _limits(low: str, high: str, names: str) -> Check:
         ends = [servo.position_text(end) for end in sorted(map(servo.joint_position, (lowest, highest)))]
         return (
             f"has {names} {lowest}..{highest}, narrower than the joint's "
-            f"{servo.lower_tick}..{servo.upper_tick}, and would refuse goals: write "
-            f"`limits: {{position: [{ends[0]}, {ends[1]}]}}` or wider {names}"
+            f"{servo.lower_tick}..{servo.upper_tick}: write "
+            f"`limits: {{position: [{ends[0]}, {ends[1]}]}}`, or widen its {names}"
         )
 
     return Check(low, fails, sentence)
@@ -108,10 +108,10 @@ def _newer(found: InspectedServo, firmware: int) -> list[ControlItem]:
 
 def _newer_sentence(found: InspectedServo, firmware: int) -> str:
     newer = _newer(found, firmware)
+    titles = " and ".join(item.title for item in newer)
     return (
-        f"has firmware {firmware}, but {' and '.join(item.title for item in newer)}, which the robot file "
-        f"declares, came with firmware {max(item.firmware for item in newer)}: remove it from `registers`, "
-        "or update the servo"
+        f"has firmware {firmware}, but `registers` in the robot file has {titles}, available from firmware "
+        f"{max(item.firmware for item in newer)}: remove it, or update the servo"
     )
 
 
@@ -119,19 +119,19 @@ def _return_delay_sentence(found: InspectedServo, raw: int) -> str:
     plan = found.plan
     total_ns = plan.budget.total_ns + (raw * 2_000 - plan.return_delay_ns) * len(plan.servos)
     return (
-        f"{found.title('return_delay_time')} is {raw}, {raw * 2} us, where "
-        f"{plan.return_delay_ns / 1000:g} us were planned; if all servos of bus {plan.name} have it, a "
-        f"cycle takes {total_ns / 1e6:.1f} ms instead of {plan.budget.total_ns / 1e6:.1f} ms, at most "
-        f"{1e9 / total_ns:.0f} Hz"
+        f"{found.title('return_delay_time')} is {raw}, {raw * 2} us instead of the planned "
+        f"{plan.return_delay_ns / 1000:g} us; with it on all servos of bus {plan.name}, a cycle takes "
+        f"{total_ns / 1e6:.1f} ms instead of {plan.budget.total_ns / 1e6:.1f} ms (at most "
+        f"{1e9 / total_ns:.0f} Hz)"
     )
 
 
 def _watchdog_sentence(found: InspectedServo, raw: int) -> str:
     item = found.items["bus_watchdog"]
-    what = f"it would stop after {raw * 20} ms without an instruction"
+    what = f"would stop the servo after {raw * 20} ms without an instruction"
     if tripped(item, raw):
-        what = "it has stopped the servo"
-    return f"{item.title} is {format_item(item, raw)}, {what}; it is cleared"
+        what = "has stopped the servo"
+    return f"{item.title} is {format_item(item, raw)} and {what}; each start clears it"
 
 
 CHECKS: tuple[Check, ...] = (
@@ -186,9 +186,8 @@ CHECKS: tuple[Check, ...] = (
         "torque_enable",
         lambda found, enabled: enabled != 0 and not found.take_over,
         lambda *_: (
-            "holds torque already, so another program may be moving it: stop that one and switch the torque "
-            "off, or take the robot over as it is with --take-over; "
-            f"{help_link('a-servo-holds-torque-already')}"
+            "holds torque already; another program may be moving it: end that program and switch the torque "
+            f"off, or keep the torque with --take-over; {help_link('a-servo-holds-torque-already')}"
         ),
     ),
     Check(
@@ -320,7 +319,8 @@ def _refusal(one: Access, found: FoundDeviation) -> str:
     command = f"dxlrun servo {one.plan.port} {one.servo.servo_id} set {item.name} {found.factory}"
     how = "" if one.plan.port == SIMULATED else f" (`{command}`)"
     link = help_link("a-setting-of-another-program-is-refused")
-    return f"has {item.title} = {found.found}, which {found.effect}: write {found.factory} there{how}; {link}"
+    wrong = f"has {item.title} = {found.found}, and this value {found.effect}"
+    return f"{wrong}: write {found.factory}{how}; {link}"
 
 
 def inspect_states(servos: Sequence[tuple[Access, Mode]], found: Findings) -> Program[None]:
@@ -341,7 +341,7 @@ def inspect_states(servos: Sequence[tuple[Access, Mode]], found: Findings) -> Pr
             if not reply.answered:
                 problem = "sends garbled replies when its state is read: do two servos have its ID?"
                 if reply.outcome is TransactionOutcome.TIMEOUT:
-                    problem = f"does not answer any more: {choose_remedy(one.plan.port, CHECK)}"
+                    problem = f"no longer answers: {choose_remedy(one.plan.port, CHECK)}"
             else:
                 raw = servo.state.position.tick(reply.parameters)
                 if again and servo.servo_id in before:
@@ -360,8 +360,8 @@ def _echoes(one: Access, found: Findings) -> Program[bool]:
     reply = yield one.reading(0, 3)
     if reply.echoed:
         found.problems.append(
-            f"bus {one.plan.name}: the adapter at {one.plan.port} echoes what it sends; use one that "
-            f"switches its receiver off while it sends; {help_link('the-adapter-echoes')}"
+            f"bus {one.plan.name}: the adapter at {one.plan.port} echoes every instruction; use an adapter "
+            f"without echo, such as a U2D2; {help_link('the-adapter-echoes')}"
         )
     return reply.echoed
 
@@ -380,7 +380,8 @@ def _answers(one: Access, found: Findings) -> Program[bool | None]:
     if disturbed > 1:
         problem = (
             f"answers {disturbed} of {PINGS} pings garbled or twice: do two servos have its ID? "
-            f"Connect them one by one and give each its own; {help_link('two-servos-have-one-id')}"
+            "Connect them one by one, and give each servo its own ID; "
+            f"{help_link('two-servos-have-one-id')}"
         )
     elif answered == 0:
         return None
@@ -396,27 +397,27 @@ def _silence(plan: BusPlan, silent: Sequence[ServoPlan]) -> str:
     """Return one sentence that names all servos of a bus that do not answer, with the remedy and the command
     that finds them.
     """
-    look = "" if plan.port == SIMULATED else f"; `dxlrun scan {plan.port}` shows which servos are there"
-    rate = f"that it runs at {plan.baud_rate} bit/s{look}"
+    look = "" if plan.port == SIMULATED else f"; list the servos with `dxlrun scan {plan.port}`"
+    rate = f"baud rate ({plan.baud_rate} bit/s){look}"
     if len(silent) == 1:
         remedy = choose_remedy(
-            plan.port, f"check power, cable, ID, and {rate}", simulated=f"check its ID, and {rate}"
+            plan.port, f"check power, cable, ID and {rate}", simulated=f"check its ID and {rate}"
         )
         return f"{plan.label(silent[0])} does not answer: {remedy}; {help_link('one-servo-does-not-answer')}"
     named = [f"{servo.own_name} (ID {servo.servo_id})" for servo in silent[:_MOST_NAMED]]
     more = ", ".join(str(servo.servo_id) for servo in silent[_MOST_NAMED:])
-    names = ", ".join(named) + (f" and those with the IDs {more}" if more else "")
+    names = ", ".join(named) + (f" and IDs {more}" if more else "")
     if len(silent) == len(plan.servos):
         remedy = choose_remedy(
-            plan.port, f"check its power, cable and port, and {rate}", simulated=f"check {rate}"
+            plan.port, f"check its power, cable, port and {rate}", simulated=f"check its {rate}"
         )
         link = help_link("no-servo-answers")
-        return f"none of the {len(silent)} servos on bus {plan.name} answers: {remedy}: {names}; {link}"
+        return f"none of the {len(silent)} servos on bus {plan.name} answers: {names}; {remedy}; {link}"
     remedy = choose_remedy(
-        plan.port, f"check power, cables, IDs, and {rate}", simulated=f"check the IDs, and {rate}"
+        plan.port, f"check power, cables, IDs and {rate}", simulated=f"check the IDs and {rate}"
     )
     link = help_link("one-servo-does-not-answer")
-    return f"{len(silent)} servos on bus {plan.name} do not answer: {names}: {remedy}; {link}"
+    return f"{len(silent)} servos on bus {plan.name} do not answer: {names}; {remedy}; {link}"
 
 
 def _unreadable(one: Access, title: str, reply: Reply) -> str:
@@ -429,7 +430,7 @@ def _unreadable(one: Access, title: str, reply: Reply) -> str:
         remedy = choose_remedy(one.plan.port, f"{CHECK}, and its {level}")
         return f"answered pings, but did not answer {ATTEMPTS} reads of {title}: {remedy}"
     if reply.outcome is TransactionOutcome.REFUSED:
-        return f"refuses to be read{one.reason(reply)}"
+        return f"rejects reads{one.reason(reply)}"
     remedy = choose_remedy(one.plan.port, " If not, check cable and ground", simulated="")
     return f"sends garbled replies to reads: do two servos have its ID?{remedy}"
 
@@ -456,6 +457,6 @@ def _jump(servo: ServoPlan, before: tuple[int, int], after: tuple[int, int]) -> 
     if moved <= fastest + 2 * servo.rad_per_tick:
         return ""
     return (
-        f"jumped by {math.degrees(moved):.1f} deg between two readings: two servos of one ID, or a broken "
+        f"jumped by {math.degrees(moved):.1f} deg between two readings: two servos with one ID, or a broken "
         "potentiometer?"
     )

@@ -212,7 +212,7 @@ class DesiredState:
         one = self._life.access_servo(index)
         entry = one.items.get(item)
         if entry is None or entry.area != "RAM" or entry.access != "RW":
-            done(f"{one.servo.joint} has no register {item} that could be written now", None)
+            done(f"{one.servo.joint} has no writable RAM register {item}", None)
             return
         register = RegisterValue(entry.address, entry.size, value, item)
         self._life.do(index, self._write_with_retries(index, register, done), entry.title, Urgency.STEERED)
@@ -238,5 +238,5 @@ class DesiredState:
 
 def _words(mode: Mode) -> str:
     if mode is Mode.UNKNOWN:
-        return "a mode that is not known"
+        return "an unknown mode"
     return f"{mode.name.lower().replace('_', '-')} mode"

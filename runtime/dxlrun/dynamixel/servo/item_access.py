@@ -150,7 +150,7 @@ class ItemAccess:
             found = item.integer(back.parameters[: item.size])
             if found == value:
                 return ""
-            problem = f"was given {item.title} = {value}, but has {found}"
+            problem = f"has {item.title} = {found} after {value} was written"
         return (yield from self._explain(item, value, problem))
 
     def _explain(self, item: ControlItem, value: int, problem: str) -> Program[str]:
@@ -164,7 +164,7 @@ class ItemAccess:
         if bound is None or abs(value) <= bound:
             return problem
         title = self.items[item.limited_by].title
-        return f"{problem}; its {title} is {bound}: write {abs(value)} or more there"
+        return f"{problem}; raise its {title} from {bound} to {abs(value)} or more"
 
     def read_bound(self, name: str) -> Program[int | None]:
         """Read the item that limits another item, such as PWM Limit for Goal PWM; None: no limit is known."""

@@ -264,7 +264,7 @@ class Life:
         after = TRANSITIONS[before].get(event)
         if after is None:
             raise IllegalTransition(
-                f"{self.servo_name(index)} is {before.value}, where {event.value} cannot happen"
+                f"{self.servo_name(index)} is {before.value}; {event.value} is invalid in this state"
             )
         self.states[index] = after
         self.torqued[index] = after in GETS_GOALS

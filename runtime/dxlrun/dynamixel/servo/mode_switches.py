@@ -227,7 +227,7 @@ def hold_servo(one: Access, wanted: Mode, *, inward: bool = False) -> Program[Ho
         if not reply.answered:
             zero = [one.items[limit.name].title for limit, raw in speed_limits.items() if raw == 0]
             refused = reply.outcome is TransactionOutcome.REFUSED
-            hint = f"; its {zero[0]} is 0: write 1 or more there" if zero and refused else ""
+            hint = f"; raise its {zero[0]} from 0 to 1 or more" if zero and refused else ""
             return HoldResult(f"did not acknowledge its goal{one.reason(reply)}{hint}")
     reply = yield from one.write_bytes(servo.torque_address, b"\x01")
     if not reply.answered:
@@ -289,7 +289,9 @@ def _read_back(one: Access, layout: GoalLayout, data: bytes) -> Program[str]:
     if enabled != 1 or found != desired:
         signed = place.encoding == "twos_complement"
         given, has = (int.from_bytes(each, "little", signed=signed) for each in (desired, found))
-        return f"was given goal {given} and torque, but has goal {has} and torque enable {enabled}"
+        return (
+            f"has goal {has} and torque enable {enabled} after goal {given} and torque enable 1 were written"
+        )
     return ""
 
 

@@ -79,9 +79,9 @@ class OfflineRecovery:
         now = self.life.now_ns()
         for index, loss in sorted(self.life.losses.items()):
             if loss.reboot is not None and loss.reboot.until_ns <= now:
-                text = f"did not come back within {REBOOT_NS * 1e-9:g} s after its reboot"
+                text = f"did not answer within {REBOOT_NS * 1e-9:g} s after its reboot"
                 remedy = choose_remedy(self.life.plan.port, CHECK)
-                self._answer(index, loss, f"{text}: {remedy}; it is probed until it is ready")
+                self._answer(index, loss, f"{text}: {remedy}; dxlrun probes it until it is ready")
 
     def switch_off(self, index: int, done: Done) -> None:
         """Switch off the torque of a RELEASED servo in idle time; `done` receives the problem."""
@@ -92,7 +92,7 @@ class OfflineRecovery:
         # In any other state a client requested torque since then, or the servo is lost; its return keeps it
         # limp.
         if self.life.states[index] is ServoState.RELEASED and not (yield from self.limp(index)):
-            problem = f"{self.life.servo_name(index)} did not confirm torque off; it is tried again"
+            problem = f"{self.life.servo_name(index)} did not confirm torque off; dxlrun sends it again"
         done(problem)
 
     def limp(self, index: int) -> Program[bool]:
@@ -210,7 +210,7 @@ class OfflineRecovery:
         problem = "" if loss.rebooted else "answers, but did not reboot"
         if loss.reboot is not None and loss.reboot.had_torque and not (torqued or loss.released):
             joint = life.plan.servos[index].joint
-            problem = problem or f"is back, limp; `dxlrun torque on {joint}` gives it torque"
+            problem = problem or f"is back and limp; switch its torque on with `dxlrun torque on {joint}`"
         self._answer(index, loss, problem)
 
     def _answer(self, index: int, loss: OfflineServo, problem: str) -> None:

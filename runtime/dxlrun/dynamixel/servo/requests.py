@@ -43,7 +43,8 @@ class Requests:
         if self._life.on(index, ServoEvent.RELEASE) is ServoState.RELEASED:
             self._offline.switch_off(index, done)
         else:
-            done(f"{self._life.servo_name(index)} does not answer: its torque stays off when it is back")
+            name = self._life.servo_name(index)
+            done(f"{name} does not answer; dxlrun switches its torque off when it is back")
 
     def torque_on(self, index: int, done: Done) -> None:
         """Switch a limp servo's torque on at its present position; a servo that already has torque only
@@ -61,7 +62,7 @@ class Requests:
         """Reboot a servo of Protocol 2.0; it gets torque again when it is back if it has torque now."""
         one = self._life.access_servo(index)
         if "reboot" not in one.table.capabilities:
-            done(f"{one} knows no reboot instruction: switch its power off and on")
+            done(f"{one} has no reboot instruction: switch its power off and on")
         elif self._life.offline(index):
             done(f"{one} does not answer")
         else:
@@ -97,7 +98,7 @@ class Requests:
         back = yield from life.access_servo(index).read_torque()
         if back.answered and back.parameters[0] == 1:
             return ""
-        return f"{name} did not confirm its torque; ask again when it answers"
+        return f"{name} did not confirm its torque; repeat the request when it answers"
 
     def _hold(self, index: int) -> Program[tuple[str, Mode]]:
         """Check a limp servo, write its registers and mode, and switch its torque on; return (problem without
@@ -112,7 +113,7 @@ class Requests:
         if found.problems:
             return "; ".join(problem.removeprefix(name) for problem in found.problems), mode
         if (yield from self._reboots.tick(index)):
-            return "rebooted while it was checked; ask again", mode
+            return "rebooted during the check; repeat the request", mode
         problem = (yield from mode_switches.hold_servo(one, mode)).problem or (yield from watchdog.arm(one))
         return problem.removeprefix(name), mode
 
@@ -126,7 +127,7 @@ class Requests:
         servo_id = one.servo.servo_id
         reply = yield from retry(one.line.instruct(servo_id, protocol2.reboot(servo_id)))
         if reply.outcome is TransactionOutcome.REFUSED:
-            done(f"{one} refuses to reboot{one.reason(reply)}")
+            done(f"{one} rejected the reboot{one.reason(reply)}")
         elif not life.offline(index):
             # The acknowledgement may be lost: the servo's clock will show whether it rebooted.
             request = RequestedReboot(had_torque, life.now_ns() + REBOOT_NS, done)

@@ -268,8 +268,8 @@ def _confirm(plan: BusPlan, found: Findings) -> Program[None]:
         elif reply.parameters[0] != 1:
             remedy = choose_remedy(plan.port, "is its supply strong enough?")
             found.problems.append(
-                f"{plan.label(servo)} lost its torque again while the others got theirs (Torque Enable "
-                f"({servo.torque_address}) is {reply.parameters[0]}): {remedy}"
+                f"{plan.label(servo)} lost its torque while the other servos were switched on (Torque "
+                f"Enable ({servo.torque_address}) is {reply.parameters[0]}): {remedy}"
             )
 
 
@@ -300,9 +300,9 @@ def _why_not_fast(plan: BusPlan, servos: list[ServoPlan]) -> Program[str]:
             old.append(f"{plan.label(servo)} has {found}")
             needed.add(first)
     if not old:
-        return "though their firmware should know it"
+        return "the servos do not answer them despite suitable firmware"
     numbers = " or ".join(f"{number}" for number in sorted(needed))
-    return f"as it needs firmware {numbers} and {', '.join(old)}"
+    return f"they need firmware {numbers}, but {', '.join(old)}"
 
 
 def _extra_ns(plan: BusPlan, refused: Mapping[int, str]) -> int:

@@ -95,7 +95,7 @@ def _limp(plan: BusPlan, now_ns: Callable[[], int], deadline_ns: int) -> Program
     for broadcast in plan.limp:
         _ = yield broadcast  # `yield from` would send the reply to a tuple
     every = [access_servo(plan, servo) for servo in plan.servos]
-    details = dict.fromkeys(range(len(plan.servos)), "it was not tried")
+    details = dict.fromkeys(range(len(plan.servos)), "torque off was not sent")
     late = False
     for longer_ns in LONGER_NS:
         for index in [index for index, detail in details.items() if detail]:
@@ -119,9 +119,9 @@ def _stand(plan: BusPlan) -> Program[list[str]]:
         if problem is None:
             continue
         if not problem:
-            sentences.append(f"{one} stands: its goal is 0")
+            sentences.append(f"{one} was stopped: its goal is 0")
         elif (yield from _is_off(one, LONGER_NS[0])):
-            sentences.append(f"{one} is limp, as {problem}")
+            sentences.append(f"{one} could not be stopped and is limp: {problem}")
         else:
             left.append((one, problem))
     # Retry only now: a servo that still moves must not wait for a silent one.
@@ -129,9 +129,9 @@ def _stand(plan: BusPlan) -> Program[list[str]]:
         for one, problem in tuple(left):
             if (yield from _is_off(one, longer_ns)):
                 left.remove((one, problem))
-                sentences.append(f"{one} is limp, as {problem}")
+                sentences.append(f"{one} could not be stopped and is limp: {problem}")
     for one, problem in left:
-        sentences.append(f"{one} may keep moving: {problem}, and torque off was not confirmed")
+        sentences.append(f"{one} may keep moving: {problem}; torque off was not confirmed")
     return sentences
 
 
@@ -146,7 +146,7 @@ def _stop(one: Access) -> Program[str | None]:
     if torque.answered and torque.parameters[0] == 0:
         return None
     if mode is Mode.UNKNOWN:
-        return "its mode is not known"
+        return "its mode is unknown"
     return (yield from mode_switches.hold_servo(one, mode)).problem
 
 

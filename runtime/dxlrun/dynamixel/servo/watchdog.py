@@ -117,10 +117,10 @@ def release_all(plan: BusPlan) -> Program[list[str]]:
         one, item = armed.pop(0)
         reply = yield from one.read_bytes(item.address, item.size)
         if not reply.answered:
-            problem = f"did not answer when its {item.title} was read: it may stop on its own"
+            problem = f"did not answer when its {item.title} was read; the watchdog may still stop it"
             problems.append(f"{one} {problem}")
         elif tripped(item, reply.word(item.size)):
-            problems.append(f"{one} was stopped by its {item.title} and stays where it stopped")
+            problems.append(f"{one} was stopped by its {item.title} and stays stopped")
         elif problem := (yield from _write(one, 0)):
             problems.append(problem)
     return problems

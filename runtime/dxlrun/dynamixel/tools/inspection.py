@@ -290,14 +290,14 @@ def _identity(plan: BusPlan, servo: ServoPlan, reply: Reply) -> Identity:
             if reply.outcome is TransactionOutcome.TIMEOUT
             else "sends garbled replies: do two servos have its ID?"
         )
-        problem = f"{name} {how}; its model is not known, so write it in the robot file"
+        problem = f"{name} {how}; its model is unknown: write it in the robot file"
         return Identity(servo.joint, "", problem)
     number, firmware = reply.word(), reply.parameters[2]
     if tables := models_by_number(number, plan.protocol, firmware):
         return Identity(servo.joint, tables[0].model, "")
     problem = (
-        f"{name} is model number {number}, firmware {firmware}, and no control table of Protocol "
-        f"{plan.protocol} has it: a plug-in can add one"
+        f"{name} has model number {number}, firmware {firmware}, without a control table of Protocol "
+        f"{plan.protocol}: add one with a plug-in"
     )
     return Identity(servo.joint, "", problem)
 

@@ -120,7 +120,7 @@ class OneNode:
             return (f"{item.title} is {target.value} already", *done)
         if target.eeprom:
             self.writable([target])
-            change = f"{item.title} is {format_item(item, before)} and becomes {target.value}"
+            change = f"{item.title} changes from {format_item(item, before)} to {target.value}"
             if not confirm(f"{self.called}: {change} (EEPROM)"):
                 return ()
         return self.write_registers([target])
@@ -130,7 +130,7 @@ class OneNode:
         self.run_program(write_registers(self.access, desired, found))
         written = [event.text for _, event in found.events]
         if found.problems:
-            before = [f"written before that: {text}" for text in written]
+            before = [f"already written: {text}" for text in written]
             raise ServoFault("\n".join([*found.problems, *before]))
         return tuple(written)
 
@@ -148,7 +148,7 @@ class OneNode:
             elif reply.outcome is not TransactionOutcome.REFUSED:
                 raise self.make_fault(f"did not answer when {item.title} was read")
             elif not refused:
-                raise self.make_fault(f"refuses to read {item.title}{self.access.reason(reply)}")
+                raise self.make_fault(f"rejects a read of {item.title}{self.access.reason(reply)}")
         return found
 
 
@@ -175,7 +175,7 @@ class OneDevice(OneNode):
 
     NOT_SET = MappingProxyType(
         {
-            name: f"{name} of a device is not set by dxlrun; use the maker's tool"
+            name: f"dxlrun does not set {name} of a device; use the manufacturer's tool"
             for name in ("id", "baud_rate")
         }
     )

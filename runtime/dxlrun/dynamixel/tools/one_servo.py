@@ -45,18 +45,18 @@ _STORED_NS = 50_000_000  # longest time of an EEPROM write [i]
 _TICK_MODULUS = 32_768
 _TICK_SPARE_MS = 500
 _SET_BY: Mapping[str, str] = {
-    "id": "`dxlrun servo PORT ID id NEW` changes it",
-    "baud_rate": "`dxlrun servo PORT ID baud RATE` changes it",
-    "baud_rate_bus": "`dxlrun servo PORT ID baud RATE` changes it",
-    "torque_enable": "`dxlrun servo PORT ID torque on` or `off` switches it",
-    "protocol_type": "dxlrun would not find the servo again; use the maker's tool",
+    "id": "use `dxlrun servo PORT ID id NEW`",
+    "baud_rate": "use `dxlrun servo PORT ID baud RATE`",
+    "baud_rate_bus": "use `dxlrun servo PORT ID baud RATE`",
+    "torque_enable": "use `dxlrun servo PORT ID torque on` or `off`",
+    "protocol_type": "dxlrun would lose the servo; use the manufacturer's tool",
 }
 """Items that `set` refuses, because a change needs more than one write, with the command that changes each.
 """
 _KEPT: Mapping[Reset, str] = {
     Reset.ALL: "ID and baud rate too",
-    Reset.KEEP_ID: "its baud rate too; its ID stays",
-    Reset.KEEP_ID_AND_BAUD_RATE: "its ID and its baud rate stay",
+    Reset.KEEP_ID: "baud rate too; the ID stays",
+    Reset.KEEP_ID_AND_BAUD_RATE: "ID and baud rate stay",
 }
 _LEDS = ("led", "led_red", "led_green", "led_blue")
 
@@ -66,7 +66,7 @@ class OneServo(OneNode):
     PortError for a lost line.
     """
 
-    NOT_SET = MappingProxyType({name: f"{name} is not set like others; {_SET_BY[name]}" for name in _SET_BY})
+    NOT_SET = MappingProxyType({name: f"{name} cannot be set here; {_SET_BY[name]}" for name in _SET_BY})
     table: ControlTable
 
     def __init__(self, tool: ToolLine, found: FoundServo) -> None:
@@ -141,10 +141,10 @@ class OneServo(OneNode):
             self.torque(False)
         if problem := self.run_program(watchdog.disarm(access_servo(self.plan, self._servo))):
             raise ServoFault(problem)
-        why = "it had stopped the servo, as no instruction came"
+        why = "it had stopped the servo"
         if not tripped(item, raw):
             why = f"it would have stopped the servo after {raw * 20} ms without an instruction"
-        done = f"cleared {item.title}, which was {format_item(item, raw)}: {why}"
+        done = f"cleared {item.title} = {format_item(item, raw)}: {why}"
         return (done, self._hold()) if stopped else (done,)
 
     # Torque and LED
@@ -173,14 +173,14 @@ class OneServo(OneNode):
         if held.problem:
             self.run_program(write_registers(self.access, [self.register("torque_enable", 0)], Findings()))
             raise self.make_fault(f"{held.problem}; its torque is off")
-        where = "" if held.goal is None else f" at tick {held.goal}, where it stood"
+        where = "" if held.goal is None else f" at its present tick {held.goal}"
         return f"holds torque in {mode.name.lower().replace('_', '-')} mode{where}"
 
     def blink(self, times: int = 5) -> str:
         """Blink the LED `times` times and restore its state; return a text about it."""
         names = [name for name in _LEDS if name in self.table.items]
         if not names:
-            raise self.make_fault("this model has no LED that can be switched")
+            raise self.make_fault("this model has no switchable LED")
         before = self.read_items(names)
         bright = [self.register(name, self.table.items[name].maximum) for name in names]
         dark = [self.register(name, 0) for name in names]
@@ -206,7 +206,7 @@ class OneServo(OneNode):
             if mode is not Mode.UNKNOWN:
                 return mode
         self.plan = self._plan()
-        raise self.make_fault("is in a mode that dxlrun does not know, so its torque stays off")
+        raise self.make_fault("is in an unknown mode; its torque stays off")
 
     def _plan(self, continuous: bool = False) -> BusPlan:
         table, name = self.table, self.tool.port.name
@@ -242,7 +242,7 @@ class OneServo(OneNode):
             InputError: The protocol does not have the ID.
         """
         if new > (highest := self.tool.line.dialect.HIGHEST_ID):
-            raise InputError(f"{new} is not an ID of Protocol {self.table.protocol}; they are 0..{highest}")
+            raise InputError(f"Protocol {self.table.protocol} has no ID {new}; give one from 0 to {highest}")
         if new == self.servo_id:
             return f"has ID {new} already"
         if not confirm(f"{self.called}: its ID becomes {new} (EEPROM)"):
@@ -257,12 +257,14 @@ class OneServo(OneNode):
             self._there(old) is not TransactionOutcome.TIMEOUT
             and self._there(new) is TransactionOutcome.TIMEOUT
         ):
-            raise self.make_fault(f"was given {item.title} = {new}, but still answers under its old one")
+            raise self.make_fault(f"still answers under its old ID after {item.title} = {new} was written")
         self.move_to(new, self.baud_rate)
         self._same()
         if self._there(old) is not TransactionOutcome.TIMEOUT:
-            raise self.make_fault(f"has its new ID, but a servo still answers under ID {old}: there were two")
-        return f"has ID {new}; it had {old}"
+            raise self.make_fault(
+                f"has its new ID, but a servo still answers under ID {old}: two servos had this ID"
+            )
+        return f"has ID {new} (before: {old})"
 
     def change_rate(self, new: int, confirm: Confirm = agree) -> str:
         """Change the baud rate of the servo in its EEPROM to `new`, bit/s; return a text, empty if it was not
@@ -276,7 +278,7 @@ class OneServo(OneNode):
         value = next((value for value, rate in self.table.baud_rates.items() if rate == new), None)
         if value is None:
             known = ", ".join(map(str, sorted(self.table.baud_rates.values())))
-            raise InputError(f"an {self.table.model} has no rate of {new} bit/s; it has {known}")
+            raise InputError(f"{self.table.model} has no baud rate of {new} bit/s; give one of {known}")
         if new == self.baud_rate:
             return f"runs at {new} bit/s already"
         if not confirm(f"{self.called}: its baud rate becomes {new} bit/s (EEPROM)"):
@@ -301,11 +303,11 @@ class OneServo(OneNode):
             if self._there(self.servo_id) is TransactionOutcome.TIMEOUT:
                 port = self.tool.port.name
                 raise self.make_fault(
-                    f"answers neither at {old} nor at {new} bit/s now; look for it: dxlrun scan {port}"
+                    f"answers neither at {old} nor at {new} bit/s; find it with `dxlrun scan {port}`"
                 )
-            raise self.make_fault(f"was given {item.title} = {value}, but still answers at {old} bit/s")
+            raise self.make_fault(f"still answers at {old} bit/s after {item.title} = {value} was written")
         self._same()
-        return f"runs at {new} bit/s; before that, at {old}"
+        return f"runs at {new} bit/s (before: {old})"
 
     def rate_item(self) -> str:
         """Return the name of the item with the baud rate of the bus; the Y series has two rates."""
@@ -314,11 +316,11 @@ class OneServo(OneNode):
     def reboot(self, confirm: Confirm = agree) -> str:
         """Reboot the servo and wait until it answers; ask for confirmation first if it holds torque."""
         if self.holds_torque() and not confirm(
-            f"{self.called} holds torque: its torque goes off, and what it holds falls"
+            f"{self.called} holds torque: the reboot switches it off, and its load can fall"
         ):
             return ""
         if "reboot" not in self.table.capabilities:
-            raise self.make_fault("this model knows no reboot instruction; switch its power off and on")
+            raise self.make_fault("this model has no reboot instruction; switch its power off and on")
         before_ns = self.tool.port.clock.now_ns()
         self._send_change(
             self.tool.line.instruct(self.servo_id, protocol2.reboot(self.servo_id)), "the reboot"
@@ -342,10 +344,12 @@ class OneServo(OneNode):
         """
         old = self.table.protocol == 1.0
         if old and keep not in (None, Reset.ALL):
-            raise InputError("a reset of Protocol 1.0 keeps neither ID nor baud rate; give --except nothing")
+            raise InputError(
+                "a factory reset of Protocol 1.0 also resets ID and baud rate; give --except nothing"
+            )
         if keep is None:
             keep = Reset.ALL if old else Reset.KEEP_ID_AND_BAUD_RATE
-        if not confirm(f"{self.called}: its EEPROM gets the factory's values ({_KEPT[keep]})"):
+        if not confirm(f"{self.called}: its EEPROM is reset to the factory values ({_KEPT[keep]})"):
             return ""
         items, table = self.table.items, self.table
         self.writable([self.register("id", self.servo_id)])
@@ -371,23 +375,23 @@ class OneServo(OneNode):
         self.move_to(servo_id, baud_rate)
         self._await()
         self._same()
-        return f"has the factory's values, ID {servo_id} at {baud_rate} bit/s"
+        return f"has the factory values, ID {servo_id} at {baud_rate} bit/s"
 
     def back_up(self, confirm: Confirm = agree) -> str:
         """Store the servo's control table in the backup memory inside the servo."""
-        if not confirm(f"{self.called}: the backup that it keeps itself is overwritten"):
+        if not confirm(f"{self.called}: its internal backup is overwritten"):
             return ""
         self._has_backup()
         self._send_change(
             self.tool.line.instruct(self.servo_id, protocol2.back_up(self.servo_id)), "the backup"
         )
         if "backup_ready" in self.table.items and not self.read_items(["backup_ready"])["backup_ready"]:
-            raise self.make_fault("acknowledged the backup, but Backup Ready is 0: there is none")
-        return "stored its control table in its own backup"
+            raise self.make_fault("acknowledged the backup, but Backup Ready is 0: nothing was stored")
+        return "stored its control table in its internal backup"
 
     def take_back(self, confirm: Confirm = agree) -> str:
         """Restore the servo's EEPROM from the backup memory inside the servo; the servo reboots."""
-        if not confirm(f"{self.called}: its EEPROM becomes that of the backup that it keeps itself"):
+        if not confirm(f"{self.called}: its EEPROM is restored from its internal backup"):
             return ""
         self._has_backup()
         self._send_change(
@@ -395,28 +399,28 @@ class OneServo(OneNode):
         )
         self._await()
         self._same()
-        return "took its EEPROM back from its own backup, and rebooted"
+        return "restored its EEPROM from its internal backup and rebooted"
 
     def restore(
         self, desired: Sequence[RegisterValue], path: Path, confirm: Confirm = agree
     ) -> tuple[str, ...]:
         """Write the registers of a backup file, `desired`, read from `path`; return a text for each write."""
         if not (differing := self.differences(desired)):
-            return (f"has everything that {path} restores already",)
+            return (f"has all values of {path} already",)
         self.writable(differing)
         names = ", ".join(each.name for each in differing)
-        if not confirm(f"{self.called}: {names} become as in {path}; its ID and its rate stay"):
+        if not confirm(f"{self.called}: {names} are restored from {path}; ID and baud rate stay"):
             return ()
         written = self.write_registers(desired)
         # A restored mode resets other registers, so compare again.
         if left := self.differences(desired):
             names = ", ".join(each.name for each in left)
-            raise self.make_fault(f"{names} changed again while others were written; try again")
+            raise self.make_fault(f"{names} changed again during the restore; try again")
         return written
 
     def _has_backup(self) -> None:
         if self.table.protocol == 1.0:
-            raise self.make_fault("servos of Protocol 1.0 have no backup of their own; give a file")
+            raise self.make_fault("servos of Protocol 1.0 have no internal backup; give a file")
         if self.holds_torque():
             raise self.make_fault(f"holds torque; switch it off first: {self.command} torque off")
 
@@ -451,7 +455,7 @@ class OneServo(OneNode):
     def _same(self) -> None:
         number = self.read_items(["model_number"])["model_number"]
         if number != self.table.model_number:
-            raise self.make_fault(f"the servo there is model number {number}, not {self.table.model_number}")
+            raise self.make_fault(f"has model number {number}, not {self.table.model_number}")
 
     def _await(self) -> None:
         end_ns = self.tool.port.clock.now_ns() + BOOT_NS
@@ -459,6 +463,6 @@ class OneServo(OneNode):
             if self.tool.port.clock.now_ns() > end_ns:
                 port = self.tool.port.name
                 raise self.make_fault(
-                    f"does not answer since {BOOT_NS * 1e-9:g} s; look for it: dxlrun scan {port}"
+                    f"has not answered for {BOOT_NS * 1e-9:g} s; find it with `dxlrun scan {port}`"
                 )
             self.tool.wait_for_packets(_PINGED_EVERY_NS)

@@ -252,7 +252,7 @@ def read_servo(line: Line, servo_id: int, port: str) -> Program[FoundServo]:
             )
         )
     if table is None:
-        remarks.append(f"no control table has its model number {number}: a plug-in can add one")
+        remarks.append(f"no control table has its model number {number}: add one with a plug-in")
         return replace(servo, model_number=number, firmware=firmware, remarks=tuple(remarks))
     if reply.error and (named := (yield from _hardware_error(line, servo_id, table))):
         remarks = [named]
@@ -321,8 +321,8 @@ def _mute(ping: Reply, reply: Reply, line: Line, port: str) -> str:
         remedy = choose_remedy(port, " If not, check cable and ground", simulated="")
         return f"sends garbled replies: do two servos have this ID?{remedy}"
     if not ping.answered:
-        return f"answered once, and then no more: {choose_remedy(port, CHECK)}"
+        return f"answered only once: {choose_remedy(port, CHECK)}"
     if reply.outcome is TransactionOutcome.REFUSED:
-        return f"refuses to be read: {line.dialect.describe_error(reply.error)}"
+        return f"rejects reads: {line.dialect.describe_error(reply.error)}"
     remedy = choose_remedy(port, f"{CHECK}, and its Status Return Level (16)")
     return f"answered a ping, but did not answer {ATTEMPTS} reads of its model number: {remedy}"

@@ -77,14 +77,14 @@ def registers_to_restore(path: Path, backup: ServoBackup, table: ControlTable) -
     wrong: list[str] = []
     if (backup.model_number, backup.protocol) != (table.model_number, table.protocol):
         raise InputError(
-            f"{path} is of a {backup.model} of Protocol {backup.protocol}, not of a {table.model} of "
+            f"{path} is a backup of {backup.model}, Protocol {backup.protocol}, not of {table.model}, "
             f"Protocol {table.protocol}; give a backup of the same model"
         )
     found: list[RegisterValue] = []
     for name, value in backup.registers.items():
         item = table.items.get(name)
         if item is None or item.access != "RW":
-            wrong.append(f"{path}: a {table.model} has no register {name} to be written; remove it")
+            wrong.append(f"{path}: a {table.model} has no writable register {name}; remove it")
         elif _stays(name):
             continue
         elif not item.minimum <= value <= item.maximum and value != item.initial:

@@ -177,7 +177,7 @@ class ToolLine:
             raise LookupError("speak a protocol first")
         (result,) = self._lines.run_programs([program])
         if result is None:
-            raise self._lines.failure or PortError(f"{self.port.name}: its program did not end")
+            raise self._lines.failure or PortError(f"{self.port.name}: a program on this line did not finish")
         return result
 
     def wait_for_packets(self, duration_ns: int) -> None:
@@ -191,8 +191,8 @@ def refuse_echo(name: str, reply: Reply) -> None:
     """
     if reply.echoed:
         raise PortError(
-            f"the adapter at {name} echoes what it sends; use one that switches its receiver off while it "
-            f"sends; {help_link('the-adapter-echoes')}"
+            f"the adapter at {name} echoes every instruction; use an adapter without echo, such as a U2D2; "
+            f"{help_link('the-adapter-echoes')}"
         )
 
 
