@@ -326,9 +326,7 @@ class DiffDriveController(Controller[DiffDriveParameters]):
             moved = linear * elapsed_ns * 1e-9, angular * elapsed_ns * 1e-9
             self._pose.move_along_arc(*(self._rims(self._angles.turned) if by_position else moved))
         elif age_ns >= 0:
-            self.context.say(
-                f"odometry continues without the distance of {age_ns * 1e-9:.2f} s with missing replies"
-            )
+            self.context.say(f"odometry lacks the distance of {age_ns * 1e-9:.2f} s without replies")
         self._holding = False
 
     def _hold(self, time_ns: int) -> None:
@@ -341,7 +339,7 @@ class DiffDriveController(Controller[DiffDriveParameters]):
             for name, valid in zip(self.context.joints, self.context.states.valid, strict=True)
             if not valid
         ]
-        self.context.say(f"odometry holds: no reply of {', '.join(silent)}")
+        self.context.say(f"odometry holds: no reply from {', '.join(silent)}")
 
     def _publish(self) -> None:
         pose, (linear, angular), message = self._pose, self._twist, self._message

@@ -63,7 +63,7 @@ class FeedForwardParameters(JointsParameters):
         if self.pass_on and self.command_interface == "position":
             yield (
                 ("pass_on",),
-                "positions are commanded already; remove pass_on, or command effort or pwm",
+                "pass_on does not fit command_interface position; remove pass_on, or command effort or pwm",
             )
 
 
@@ -122,9 +122,10 @@ class FeedForward(Controller[FeedForwardParameters]):
         parameters, joints, limits = self.parameters, context.joints, context.limits
         motors = [motor for motor in context.motors if motor is not None]
         if len(motors) < len(joints):
-            raise ValueError("there is a joint without a motor file; `dxlrun identify` writes one")
+            lacking = [name for name, motor in zip(joints, context.motors, strict=True) if motor is None]
+            raise ValueError(f"no motor file for {', '.join(lacking)}; write one with `dxlrun identify`")
         if parameters.pass_on and not context.into:
-            raise ValueError("pass_on is for a controller below: write `into`, or remove pass_on")
+            raise ValueError("pass_on needs the key `into`; write `into`, or remove pass_on")
         count, interface = len(joints), parameters.command_interface
         self._ahead = MotionAhead(
             count, finite_or(limits.velocity, np.inf), finite_or(limits.acceleration, np.inf)

@@ -126,9 +126,7 @@ class GravityCompensation(Controller[GravityParameters]):
             )
             return
         if robot.urdf is None:
-            yield Mismatch(
-                "needs the robot's URDF, and the file names none", "write `model: {urdf: NAME.urdf}`"
-            )
+            yield Mismatch("needs a URDF, but the robot file names none", "write `model: {urdf: NAME.urdf}`")
             return
         try:
             bodies = bodies_of(robot.urdf)
@@ -150,7 +148,7 @@ class GravityCompensation(Controller[GravityParameters]):
         super().on_configure(context)
         parameters, joints, limits = self.parameters, context.joints, context.limits
         if context.urdf is None:
-            raise ValueError("there is no URDF")
+            raise ValueError("no URDF; write `model: {urdf: NAME.urdf}`")
         count, interface = len(joints), parameters.command_interface
         others = [name for name in context.read_names if name.endswith("/position")]
         self._others = len(others)
@@ -238,33 +236,31 @@ def _of_joint(bodies: Bodies, joint: str, unit: JointUnit) -> Iterator[Mismatch]
     """Yield the first problem of the URDF with a joint: missing, of the wrong type, or without a mass."""
     if joint not in bodies.joints:
         yield Mismatch(
-            f"needs {joint} in the URDF, which does not have it",
-            "give the joints of both files the same names",
+            f"needs {joint}, but the URDF lacks it",
+            "use the same joint names in both files",
             joint,
         )
         return
     if (kind := bodies.joints[joint].get("type")) not in MOVABLE:
-        yield Mismatch(
-            f"needs {joint} to move in the URDF, where it is {kind}", "make it revolute there", joint
-        )
+        yield Mismatch(f"needs {joint} to move, but it is {kind} in the URDF", "make it revolute", joint)
         return
     if kind not in TYPES[unit]:
         yield Mismatch(
-            f"needs the URDF to {_MOVE[unit]} {joint}, where it is {kind}",
-            f"make it {TYPES[unit][0]} there",
+            f"needs {joint} to {_MOVE[unit]}, but it is {kind} in the URDF",
+            f"make it {TYPES[unit][0]}",
             joint,
         )
         return
     unknown = [link for link in bodies.moved(joint) if link in bodies.shaped and bodies.masses[link] is None]
     if unknown:
         yield Mismatch(
-            f"needs the mass of {', '.join(unknown)}, which {joint} moves: the URDF has no inertial there",
+            f"needs the mass of {', '.join(unknown)}, moved by {joint}, but the URDF has no <inertial> there",
             "write <inertial> with origin, mass and inertia into the link",
             joint,
         )
     elif not bodies.mass(joint):
         yield Mismatch(
-            f"has nothing to hold at {joint}, which moves no mass in the URDF",
+            f"has nothing to hold at {joint}: it moves no mass in the URDF",
             "write <inertial> into the links after it, or remove the joint",
             joint,
         )
@@ -276,10 +272,10 @@ def _of_payload(bodies: Bodies, parameters: GravityParameters, joints: Sequence[
     link, at = parameters.payload.link, "payload.link"
     if link not in bodies.masses:
         known = ", ".join(bodies.masses)
-        yield Mismatch(f"hangs its payload on {link}, which is not a link of the URDF", f"it has {known}", at)
+        yield Mismatch(f"has its payload on {link}, but the URDF has no such link", f"use one of {known}", at)
     elif not any(link in bodies.moved(joint) for joint in joints if joint in bodies.joints):
         yield Mismatch(
-            f"hangs its payload on {link}, which none of its joints moves",
-            "name a link after one of them",
+            f"has its payload on {link}, but none of its joints moves {link}",
+            "name a link after one of its joints",
             at,
         )

@@ -123,14 +123,14 @@ class GripperParameters(ParametersModel):
         """
         yield from super().mistakes()
         if len(self.widths) == 1:
-            yield ("widths",), "one width makes no line; write at least two, such as open and closed"
+            yield ("widths",), "one width is not enough; write at least two, such as open and closed"
             return
         ordered = sorted(self.widths, key=lambda point: point.angle)
         steps = (
             np.diff([[point.angle, point.width] for point in ordered], axis=0) if ordered else np.ones((1, 2))
         )
         if (steps[:, 0] == 0).any() or not ((steps[:, 1] > 0).all() or (steps[:, 1] < 0).all()):
-            yield ("widths",), "widths must all grow, or all shrink, with the angle; each angle stands once"
+            yield ("widths",), "widths must all grow, or all shrink, with the angle; write each angle once"
 
 
 _OF_THE_WAY = ("speed", "tolerance", "stall_speed")
@@ -146,7 +146,7 @@ _FIXES: Mapping[JointUnit, Mapping[str, str]] = {
 }
 _POSITIONS: Mapping[JointUnit, str] = {
     ROTARY: "an angle, such as 20 deg",
-    LINEAR: "a length, such as 10 mm: its joint is linear",
+    LINEAR: "a length, such as 10 mm: the joint is linear",
 }
 
 
@@ -218,7 +218,7 @@ class GripperController(Controller[GripperParameters]):
         for key in needed:
             unit, written = robot.units[0], parameters.unit_of(key)
             if written is not unit:
-                what = f"moves {parameters.joint}, which {unit.verb}, but its {key} is of {written.quantity}"
+                what = f"has {key} as {written.quantity}, but {parameters.joint} {unit.verb}"
                 yield Mismatch(what, f"write {key} as {_FIXES[unit].get(key, 'angles')}", key)
 
     @classmethod
@@ -241,7 +241,7 @@ class GripperController(Controller[GripperParameters]):
         if not isinstance(command, GripCommand):
             return super().prepare(kind, command, parameters)
         if command.effort is not None and parameters.effort is None:
-            raise ValueError("its joint has no limit of effort; write one as `effort` in the robot file")
+            raise ValueError("the gripper has no effort limit; write `effort` in the robot file")
         unit = parameters.unit_of("speed")
         if command._unit is not None and command._unit is not unit:
             raise ValueError(f"the position must be {_POSITIONS[unit]}")
@@ -249,7 +249,9 @@ class GripperController(Controller[GripperParameters]):
         if command.width is None:
             return np.array([command.position, effort])
         if not parameters.widths:
-            raise ValueError("it has no widths; give a position, or write `widths` in the robot file")
+            raise ValueError(
+                "the gripper has no widths; give a position, or write `widths` in the robot file"
+            )
         angles, widths = _table(parameters)
         if not widths.min() <= command.width <= widths.max():
             raise ValueError(
@@ -338,7 +340,7 @@ class GripperController(Controller[GripperParameters]):
         """End or report an active goal by the measured position; without a reply, only by the timeout."""
         if not self.context.states.valid[0]:
             if time_ns - self._began_ns >= self.parameters.timeout:
-                self._end_goal(Outcome.MISSED, "no reply of its servo")
+                self._end_goal(Outcome.MISSED, "no reply from its servo")
             return
         position = float(self.context.states.position[0])
         error = abs(self._target - position)
@@ -353,7 +355,7 @@ class GripperController(Controller[GripperParameters]):
             self._hand_over(f"stalled, holds something at {self._place(position)}", np.inf, np.inf, 0)
             return
         if time_ns - self._began_ns >= self.parameters.timeout:
-            self._end_goal(Outcome.MISSED, f"not there after {self.parameters.timeout * 1e-9:g} s")
+            self._end_goal(Outcome.MISSED, f"goal not reached after {self.parameters.timeout * 1e-9:g} s")
             return
         goal.feedback(max(0.0, 1.0 - error / self._way) if self._way else 0.0, error)
 

@@ -66,20 +66,19 @@ class LeaderFollowerParameters(ParametersModel):
         yield from super().mistakes()
         led = {pair.leader for pair in self.pairs if pair.leader}
         if not led and self.command_interface == "posvel":
-            what = "posvel commands the speed of leaders"
-            yield ("command_interface",), f"{what}; name them, or take `position`"
+            yield ("command_interface",), "posvel needs leaders; name the leaders, or use `position`"
         for index, pair in enumerate(self.pairs):
             place = ("pairs", index)
             if led and not pair.leader:
-                what = f"{pair.joint} has no leader, other joints have one"
-                yield place, f"{what}; give it one, or none to all"
+                what = f"{pair.joint} has no leader, unlike other joints"
+                yield place, f"{what}; name a leader for every joint, or for none"
             if not led and (pair.scale != 1.0 or pair.offset):
-                yield place, "scale and offset are for a leader; name it, or remove them"
+                yield place, "scale and offset need a leader; name a leader, or remove them"
             if pair.scale == 0.0:
-                what = "a scale of 0 follows nothing"
-                yield (*place, "scale"), f"{what}; write another number, -1 for the other way"
+                what = "with a scale of 0 the joint does not follow"
+                yield (*place, "scale"), f"{what}; write another number, such as -1 to reverse"
             if pair.joint in led:
-                yield (*place, "joint"), f"{pair.joint} is leader and follower; a joint is one of the two"
+                yield (*place, "joint"), f"{pair.joint} is leader and follower; remove one of the two"
 
 
 class LeaderFollower(Controller[LeaderFollowerParameters]):
@@ -112,7 +111,7 @@ class LeaderFollower(Controller[LeaderFollowerParameters]):
             ValueError: The joints follow leaders, or the number of positions is wrong.
         """
         if parameters.pairs[0].leader:
-            raise ValueError("its joints follow leaders, so it takes no positions")
+            raise ValueError("the joints follow leaders; positions are not accepted")
         return super().prepare(kind, command, parameters)
 
     def on_configure(self, context: Context) -> None:
@@ -194,7 +193,7 @@ class LeaderFollower(Controller[LeaderFollowerParameters]):
         worst = int(np.argmax(np.where(np.isnan(self._leader_age), np.inf, self._leader_age)))
         leader = self.parameters.pairs[worst].leader
         since = "yet" if np.isnan(age_s) else f"for {age_s:.2f} s"
-        self.context.say(f"no reply of leader {leader} {since}, holding")
+        self.context.say(f"no reply from leader {leader} {since}, holding")
 
     def _command_speed(self, step: Floats) -> None:
         """Command the leader's speed to joints that have caught up, and the approach speed to the others."""

@@ -59,10 +59,10 @@ class PidParameters(JointsParameters):
         """Yield a command interface or a `wrap` that does not fit the quantity `reference`."""
         yield from super().mistakes()
         if self.reference == "velocity" and self.command_interface == "position":
-            what = "a velocity reference cannot be commanded as positions"
+            what = "reference velocity does not fit command_interface position"
             yield ("command_interface",), f"{what}; command effort, velocity or pwm"
         if self.reference == "velocity" and self.wrap:
-            yield ("wrap",), "velocities do not wrap; remove wrap, or take the reference position"
+            yield ("wrap",), "velocities do not wrap; remove wrap, or use reference position"
 
 
 _KIND: Final = {"position": "positions", "velocity": "velocities"}
@@ -137,7 +137,7 @@ class PidController(Controller[PidParameters]):
             ValueError: The command does not fit the reference, or the number of values is wrong.
         """
         if kind != (own := _KIND[parameters.reference]):
-            raise ValueError(f"its reference is the {parameters.reference}, so it takes {own}, not {kind}")
+            raise ValueError(f"its reference is the {parameters.reference}; send {own} instead of {kind}")
         return super().prepare(kind, command, parameters)
 
     def on_configure(self, context: Context) -> None:

@@ -108,7 +108,7 @@ class ThermalGovernor(Controller[ThermalParameters]):
             if servo is None:
                 yield Mismatch(
                     f"cannot limit the temperature of {joint}: it has several servos",
-                    "leave the joint to the servos' own limits",
+                    "remove the joint; its servos have their own limits",
                     joint,
                 )
                 continue
@@ -122,7 +122,8 @@ class ThermalGovernor(Controller[ThermalParameters]):
         count, interface = len(joints), parameters.command_interface
         servos = [servo for servo in context.servos if servo is not None]
         if len(servos) < count:
-            raise ValueError("there is a joint with several servos, or none that is known")
+            wrong = [name for name, servo in zip(joints, context.servos, strict=True) if servo is None]
+            raise ValueError(f"several servos, or an unknown one, at {', '.join(wrong)}")
         rows = list(zip(joints, servos, context.motors, strict=True))
         thresholds = [_thresholds(parameters, joint, servo) for joint, servo, _ in rows]
         self._warn, self._limit = (np.array(each, dtype=np.float64) for each in zip(*thresholds, strict=True))
@@ -200,7 +201,7 @@ class ThermalGovernor(Controller[ThermalParameters]):
             beyond[row] = now[row]
             name, celsius, at = self._labels[row], temperature[row], threshold[row]
             if beyond[row]:
-                self.context.warn(f"{name} is at {celsius:.1f} deg C: from {at:g} on {what}")
+                self.context.warn(f"{name} is at {celsius:.1f} deg C (threshold {at:g}): {what}")
             else:
                 self.context.say(f"{name} has cooled down to {celsius:.1f} deg C, below {at:g}")
 
@@ -241,18 +242,18 @@ def _of_thresholds(parameters: ThermalParameters, joint: str, servo: ServoModel)
     own = servo.temperature_limit
     if np.isnan(warn) or np.isnan(limit):
         yield Mismatch(
-            f"does not know the temperature limit of {joint}, an {servo.model}", "write warn and limit", joint
+            f"needs the temperature limit of {joint} ({servo.model})", "write warn and limit", joint
         )
     elif own is not None and limit >= own:
         yield Mismatch(
-            f"lets {joint} become {limit:g} deg C hot, but its {servo.model} cuts its torque beyond {own:g}",
-            f"write limit: {own - LIMIT_BELOW:g} at most",
+            f"has {limit:g} deg C as limit of {joint}, but the {servo.model} cuts torque beyond {own:g}",
+            f"write limit: {own - LIMIT_BELOW:g} or less",
             _key("limit", parameters.limit),
         )
     elif warn >= limit:
         yield Mismatch(
-            f"has the threshold warn of {joint} at {warn:g} deg C, not below its limit of {limit:g}",
-            f"write warn: {limit - 10:g}, so that the torque is taken smoothly",
+            f"has warn of {joint} at {warn:g} deg C, not below its limit of {limit:g}",
+            f"write warn: {limit - 10:g} for a smooth reduction of the torque",
             _key("warn", parameters.warn) if parameters.warn is not None else _key("limit", parameters.limit),
         )
 
@@ -263,7 +264,7 @@ def _of_figures(
     interface = parameters.command_interface
     if interface == "position" and _reach(parameters, joint, motor) is None:
         yield Mismatch(
-            f"does not know at which error {joint} gives all its torque",
+            f"needs the error for the full torque of {joint}",
             "write reach: 15 deg, name a motor file with a position_gain, or command poseffort",
             joint,
         )
@@ -272,9 +273,7 @@ def _of_figures(
         and value_for(parameters.most, joint) is None
         and np.isnan(_stall(servo))
     ):
-        yield Mismatch(
-            f"does not know the highest effort of {joint}", "write most, in the unit that it measures", joint
-        )
+        yield Mismatch(f"needs the highest effort of {joint}", "write most, in the unit of its effort", joint)
 
 
 def _key(name: str, value: object) -> str:

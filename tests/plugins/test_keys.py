@@ -145,13 +145,13 @@ WRONG_KEYS: Mapping[str, tuple[Keys, list[tuple[Keys, str]]]] = {
         ({"timeout": "0 s"}, "timeout"),
     ]),
     "fall_reflex": (FALL, [
-        ({"roll": ["10 deg", "40 deg"]}, "roll is from an angle below 0 to one above"),
-        ({"pitch": ["40 deg", "-40 deg"]}, "pitch is from an angle below 0 to one above"),
+        ({"roll": ["10 deg", "40 deg"]}, "the range of roll does not enclose 0"),
+        ({"pitch": ["40 deg", "-40 deg"]}, "the range of pitch does not enclose 0"),
         ({"activate": []}, "at least 1 item"),
         ({"timeout": "0 s"}, "greater than 0"),
     ]),
     "feed_forward": (TWO, [
-        ({"pass_on": True}, "positions are commanded already; remove pass_on"),
+        ({"pass_on": True}, "pass_on does not fit command_interface position; remove pass_on"),
         ({"scale": 1.5}, "less than or equal to 1"),
         ({"scale": {"c": 1.0}}, "c is not one of its joints"),
         ({"most": 0.0}, "greater than 0"),
@@ -159,9 +159,9 @@ WRONG_KEYS: Mapping[str, tuple[Keys, list[tuple[Keys, str]]]] = {
         ({"command_interface": "velocity"}, "position"),
     ]),
     "gripper_controller": (WIDE, [
-        ({"widths": WIDTHS[:1]}, "one width makes no line"),
+        ({"widths": WIDTHS[:1]}, "one width is not enough"),
         ({"widths": [*WIDTHS, {"angle": "1 rad", "width": "50 mm"}]}, "must all grow, or all shrink"),
-        ({"widths": [WIDTHS[0], WIDTHS[0]]}, "each angle stands once"),
+        ({"widths": [WIDTHS[0], WIDTHS[0]]}, "write each angle once"),
         ({"effort": 0.0}, "greater than 0"),
     ]),
     "ilc_controller": (TWO, [
@@ -205,10 +205,10 @@ WRONG_KEYS: Mapping[str, tuple[Keys, list[tuple[Keys, str]]]] = {
     "leader_follower": (LED, [
         ({"pairs": []}, "at least 1 item"),
         ({"pairs": [{"joint": "f", "leader": "l"}, {"joint": "g"}]}, "g has no leader"),
-        ({"pairs": [{"joint": "f", "scale": 2.0}]}, "scale and offset are for a leader"),
-        ({"pairs": [{"joint": "f", "leader": "l", "scale": 0.0}]}, "a scale of 0"),
+        ({"pairs": [{"joint": "f", "scale": 2.0}]}, "scale and offset need a leader"),
+        ({"pairs": [{"joint": "f", "leader": "l", "scale": 0.0}]}, "with a scale of 0"),
         ({"pairs": [{"joint": "f", "leader": "l"}, {"joint": "g", "leader": "f"}]}, "is leader and follower"),
-        (STREAM | POSVEL, "posvel commands the speed of leaders"),
+        (STREAM | POSVEL, "posvel needs leaders"),
     ]),
     "pid_controller": (PID, [
         ({"gains": {"p": -1.0}}, "greater than or equal to 0"),
@@ -224,13 +224,13 @@ WRONG_KEYS: Mapping[str, tuple[Keys, list[tuple[Keys, str]]]] = {
         ({"bounds": {"range": {"c": ["0.1 rad", "0.2 rad"]}}}, "c is not one of its joints"),
     ]),
     "sensor_broadcaster": ({"message": "Range"}, [
-        ({"fields": {"rang": "sonar/range"}}, "Range has no number rang; it has radiation_type"),
-        ({"fields": {"range": 1.0}}, "name at least one state"),
+        ({"fields": {"rang": "sonar/range"}}, "Range has no numeric field rang; use one of radiation_type"),
+        ({"fields": {"range": 1.0}}, "no field or cell names a state"),
         ({"fields": {"range": "sonar"}}, "sonar is not a state"),
-        ({"fields": {"radiation_type": "a/b"}}, "radiation_type of Range is a whole number"),
-        ({"fields": {"radiation_type": 0.5, "range": "a/b"}}, "is a whole number"),
-        ({"cells": {"a/b": ["1 mm", "1 mm"]}}, "cells make a WrenchStamped, not a Range"),
-        ({**FOOT, "fields": {"wrench.force.z": "a/b"}}, "wrench.force.z follows from the cells"),
+        ({"fields": {"radiation_type": "a/b"}}, "radiation_type of Range must be a whole number"),
+        ({"fields": {"radiation_type": 0.5, "range": "a/b"}}, "must be a whole number"),
+        ({"cells": {"a/b": ["1 mm", "1 mm"]}}, "cells are only for WrenchStamped, not Range"),
+        ({**FOOT, "fields": {"wrench.force.z": "a/b"}}, "wrench.force.z is computed from the cells"),
         ({"message": "Imu", "fields": {}}, "Input should be"),
     ]),
     "thermal_governor": (TWO, [
@@ -277,13 +277,13 @@ def points(*positions: float, time: float | str = 1.0) -> list[Keys]:
                 ({"pwm": [0.2, 20]}, "less than or equal to 1"),  # it was meant in percent
             ]),
             ("pid_controller", PID, "velocities", [
-                ({"velocities": [1, 2]}, "its reference is the position, so it takes positions"),
+                ({"velocities": [1, 2]}, "its reference is the position; send positions"),
             ]),
             ("pid_controller", PID | VELOCITY, "positions", [
-                ({"positions": [1, 2]}, "so it takes velocities, not positions"),
+                ({"positions": [1, 2]}, "send velocities instead of positions"),
             ]),
             ("pid_controller", PID, "positions", [({"positions": [1]}, "1 positions for 2 joints")]),
-            ("leader_follower", LED, "positions", [({"positions": [1]}, "its joints follow leaders")]),
+            ("leader_follower", LED, "positions", [({"positions": [1]}, "the joints follow leaders")]),
             ("leader_follower", STREAM, "positions", [({"positions": [1]}, "1 positions for 2 joints")]),
             ("diff_drive_controller", BASE, "velocity", [
                 ({"linear": math.nan}, "finite"),
@@ -308,11 +308,11 @@ def points(*positions: float, time: float | str = 1.0) -> list[Keys]:
             ]),
             *(
                 ("sample_player", TWO | {"bounds": {"range": {"b": ("-0.5 rad", "0.5 rad")}}}, kind, [
-                    ({"rows": [], **more}, "there is no row; give at least one"),
-                    ({"rows": [[0.1, 0.1], [0.1]], **more}, r"1 numbers in row 2 for 2 joints \(a, b\)"),
+                    ({"rows": [], **more}, "the table has no rows; give at least one"),
+                    ({"rows": [[0.1, 0.1], [0.1]], **more}, r"row 2 has 1 numbers; .* of 2 joints \(a, b\)"),
                     (
                         {"rows": [[0.1, 0.1], [0.1, 0.7]], **more},
-                        "row 2 sends b to 0.7 rad, outside of its range of -0.5 to 0.5 rad",
+                        "row 2 moves b to 0.7 rad, outside its range of -0.5 to 0.5 rad",
                     ),
                 ])
                 for kind, more in (("rows", {}), ("samples", {"period": 0.02}))
@@ -327,8 +327,8 @@ def points(*positions: float, time: float | str = 1.0) -> list[Keys]:
                 ({"position": "30 mm"}, "the position must be an angle"),
             ]),
             ("gripper_controller", GRIPPER, "grip", [
-                ({"width": 0.03}, "it has no widths"),
-                ({"position": 0.3, "effort": 0.1}, "no limit of effort"),
+                ({"width": 0.03}, "the gripper has no widths"),
+                ({"position": 0.3, "effort": 0.1}, "no effort limit"),
             ]),
             ("gripper_controller", GRIPPER | {"speed": "5 mm/s"}, "grip", [
                 ({"position": "30 deg"}, "must be a length, such as 10 mm"),

@@ -95,7 +95,7 @@ def test_followers_of_a_leader_that_does_not_answer_hold_until_it_does(tmp_path)
     )
 
     (sentence,) = said(run)[:1]
-    assert sentence.startswith("no reply of leader left_elbow for 0.1")
+    assert sentence.startswith("no reply from leader left_elbow for 0.1")
     cycles, joints = run.log.cycles, run.log.joints
     held = cycles["goal_position"][440:580, joints.index("right_elbow")]
     assert np.ptp(held) == 0.0

@@ -301,5 +301,5 @@ def test_a_player_goes_on_without_a_released_joint_and_begins_without_it(run):
     assert (shoulder, elbow) == (pytest.approx(20, abs=0.5), pytest.approx(0, abs=0.5))
     assert one.robot.buses[0].servo(2).registers["goal_position"] == 2048, "it got no goal"
     ended = [event.text for event in log.events if event.code == EventCode.GOAL_ENDED]
-    assert ended == ["goal 1 reached: played nod, without elbow for want of torque"]
+    assert ended == ["goal 1 reached: played nod, without elbow (no torque)"]
     assert one.torque(log, 1)[-1] is Torque.RELEASED

@@ -32,18 +32,18 @@ WRONG = {
         "11:60: imu delivers a sample every 100 ms, but counts as lost after 100 ms without one"
     ),
     "{type: serial_imu, port: /dev/imu, scale: {angular_velocty: 0.0174533}}": (
-        "11:50: sensors.imu.scale: no column is a state of angular_velocty; "
-        "there are angular_velocity, linear_acceleration"
+        "11:50: sensors.imu.scale: no column belongs to angular_velocty; "
+        "the groups are angular_velocity, linear_acceleration"
     ),
     "{type: serial_imu, port: /dev/imu, columns: []}": "11:52: sensors.imu.columns has too few",
     "{type: serial_imu, port: /dev/imu, columns: ['-']}": (
-        "11:52: sensors.imu.columns: no column is a state; name one at least"
+        "11:52: sensors.imu.columns: no column is a state; name at least one"
     ),
     "{type: serial_imu, port: /dev/imu, columns: [age]}": (
-        "11:52: sensors.imu.columns: 'age' is not a name of a state; write one such as angular_velocity.x"
+        "11:52: sensors.imu.columns: 'age' is not a valid state; write a name such as angular_velocity.x"
     ),
     "{type: serial_imu, port: /dev/imu, columns: [a, a]}": (
-        "11:52: sensors.imu.columns: a is there twice; name each state once"
+        "11:52: sensors.imu.columns: a occurs twice; name each state once"
     ),
 }
 

@@ -105,7 +105,7 @@ def test_columns_scale_and_prefix(device):
     device.send(b"$IMU,12:30,0.5,2\n$GPS,1,2,3\n$IMU,0,0.5,-\n")
     assert imu.states(imu.parameters) == ("angular_velocity.z", "linear_acceleration.x")
     assert sample(imu) == [0.5, 2 * 9.80665]
-    assert device.said == ["2 lines are no sample of 3 numbers, the last one: $IMU,0,0.5,-"]
+    assert device.said == ["2 lines are not a sample of 3 numbers; last line: $IMU,0,0.5,-"]
     imu.close()
 
 
@@ -120,7 +120,7 @@ def test_garbage_is_reported_and_not_used(device, garbage):
         device.send(garbage[start : start + 2000])
         assert sample(imu) is None
     assert len(device.said) == 1
-    assert "no sample of 6 numbers" in device.said[0]
+    assert "a sample of 6 numbers" in device.said[0]
     assert len(device.said[0]) < 300
     device.send(b"\n" + LINE)
     assert sample(imu) is not None

@@ -234,5 +234,5 @@ def _mass(link: Element) -> float | None:
     except ValueError:
         value = math.nan
     if not (math.isfinite(value) and value >= 0.0):
-        raise ValueError(f"link {_name(link)} has the mass {text or 'of no value'}")
+        raise ValueError(f"the mass of link {_name(link)} is {text or 'empty'}, not a number of at least 0")
     return value

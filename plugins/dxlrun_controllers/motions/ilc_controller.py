@@ -183,9 +183,7 @@ class IlcController(JointTrajectoryController):
         self._open = True
         known = self._known.found(self._key)
         if known is None:
-            self.context.say(
-                f"motion {motion_name(self._key)} is not known: it is played without a correction"
-            )
+            self.context.say(f"motion {motion_name(self._key)} is not learned yet: no correction")
         else:
             self._known.mark_played(known)
         self._play(known, time_ns)
@@ -239,7 +237,7 @@ class IlcController(JointTrajectoryController):
                 return -1
             self._row_ns, self._largest = time_ns, 0.0
             if self._pupil is not None:
-                self._spoil("the one before is still being learned")
+                self._spoil("the previous repetition is still being learned")
             else:
                 self._repetition.start_recording()
         return round((time_ns - self._row_ns) / self.context.period_ns)
@@ -347,14 +345,14 @@ class IlcController(JointTrajectoryController):
         Two in a row mean that the servo or its load has changed.
         """
         times = error / max(motion.best, LEAST)
-        worse = f"its error, {math.degrees(error):.3f} deg, is {times:.1f} times the smallest one"
+        worse = f"its error, {math.degrees(error):.3f} deg, is {times:.1f} times the smallest error"
         if motion.grown == 1:
             self.context.say(f"nothing is learned from this repetition of motion {motion.name}: {worse}")
             return
         self._known.forget_motion(motion)
         self._stay(motion)
         self.context.keep(self._known.packed())
-        self.context.say(f"what was learned of motion {motion.name} is dropped: again {worse}")
+        self.context.say(f"the correction of motion {motion.name} is dropped: again {worse}")
 
     def _stay(self, motion: LearnedMotion) -> None:
         """Freeze the applied correction if it belongs to a motion that was forgotten."""
@@ -372,7 +370,7 @@ class IlcController(JointTrajectoryController):
             return
         forgotten = self._known.learned(motion)
         if forgotten is not None:
-            self.context.say(f"motion {forgotten.name} is forgotten: {motion.name} takes its place")
+            self.context.say(f"the correction of motion {forgotten.name} is dropped for motion {motion.name}")
             self._stay(forgotten)
         if self._key == motion.key and not self._frozen:
             self._play(motion, time_ns)
@@ -387,4 +385,4 @@ class IlcController(JointTrajectoryController):
             self._known.unpack(data)
         except (ValueError, struct.error) as error:
             self._known.clear_motions()
-            self.context.say(f"what was learned before cannot be used: {error}")
+            self.context.say(f"the stored corrections cannot be used: {error}")

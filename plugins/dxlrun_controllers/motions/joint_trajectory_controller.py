@@ -302,7 +302,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
             if step > np.pi * (1 + 1e-9):
                 self.context.warn(
                     f"joint {self.context.joints[row]} turns by {math.degrees(step):.4g} deg "
-                    "from one point to the next; write wrap: true for it if it shall take the shorter way"
+                    "from one point to the next; write wrap: true for the joint to take the shorter way"
                 )
 
     def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
@@ -321,7 +321,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         begin = self._path_of(moved)
         points = whole_turns(data[len(head) :], begin.position, self._wrap & moved)
         if track.trajectory.join(points, begin, late_s, blend_s, self._limits):
-            self._end_goal(Outcome.PREEMPTED, time_ns, "a chunk of positions took its place")
+            self._end_goal(Outcome.PREEMPTED, time_ns, "replaced by a chunk of positions")
             self._tracks.start_track(track, moved, self._warped(time_ns))
             self._set_track(track, moved)
             self._base_ns, self._base_s = time_ns, 0.0
@@ -403,8 +403,8 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         joint, limit = self.context.joints[row], self._speed_limit[row]
         needed_s = math.ceil(1e3 * time_s * speeds[row] / limit - 1e-6) * 1e-3
         text = (
-            f"joint {joint} has {way[row]:.4g} to go to the first point in {time_s:.4g} s, at "
-            f"{speeds[row]:.4g} a second, more than its limit of {limit:.4g}: give the point "
+            f"joint {joint} needs {speeds[row]:.4g} a second to the first point, {way[row]:.4g} away in "
+            f"{time_s:.4g} s, more than its limit of {limit:.4g}; give the point "
             f"{needed_s:.4g} s or more, as its time or by start_in"
         )
         goal, self._goal = self._goal, None
@@ -517,7 +517,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         goal.judge(self._trajectory.end_position, joints=joints, tolerances=tolerances, text=text)
 
     def _time_out(self, time_ns: int) -> None:
-        text = f"after {(time_ns - self._start_ns) * 1e-9:.3f} s, its time-out"
+        text = f"timeout after {(time_ns - self._start_ns) * 1e-9:.3f} s"
         if self._spliced is not None and self._goal is not None:
             # The active trajectory is still the previous one, so its end must not decide this goal.
             joints = self._names_of(self._spliced[-len(self._moved) :] != 0)
@@ -588,4 +588,4 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
             return f"joint {joint} is {unit.text(float(self._error[row]))} off its path"
         speeds = (self.context.states.velocity, self._desired.velocity, self._within.path_velocity)
         actual, desired, allowed = (unit.speed_text(float(of[row])) for of in speeds)
-        return f"joint {joint} moves at {actual} instead of {desired}, {allowed} allowed"
+        return f"joint {joint} moves at {actual} instead of {desired}; the tolerance is {allowed}"

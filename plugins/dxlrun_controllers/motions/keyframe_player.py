@@ -122,12 +122,12 @@ class KeyframeParameters(ParametersModel):
     def mistakes(self) -> Iterator[Mistake]:
         """Yield unknown names of motions and joints, and motions that follow each other in a circle."""
         yield from super().mistakes()
-        known = f"there are {', '.join(self.motions)}"
+        known = f"the motions are {', '.join(self.motions)}"
         for index, joint in enumerate(self.wrap):
             if joint not in self.joints:
                 yield ("wrap", index), f"{joint} is {not_one_of(self.joints)}"
         if self.start is not None and self.start not in self.motions:
-            yield ("start",), f"there is no motion {self.start}; {known}"
+            yield ("start",), f"motion {self.start} is not defined; {known}"
         for name, motion in self.motions.items():
             for number, step in enumerate(motion.steps):
                 for key, named in (("pose", step.pose), ("torque", step.torque)):
@@ -136,10 +136,13 @@ class KeyframeParameters(ParametersModel):
                             place = ("motions", name, "steps", number, key, joint)
                             yield place, f"{joint} is {not_one_of(self.joints)}"
             if motion.next is not None and motion.next not in self.motions:
-                yield ("motions", name, "next"), f"there is no motion {motion.next}; {known}"
+                yield ("motions", name, "next"), f"motion {motion.next} is not defined; {known}"
         for circle in self._circles():
             way = " -> ".join((*circle, circle[0]))
-            yield ("motions", circle[0], "next"), f"motions follow each other in a circle: {way}; end it"
+            yield (
+                ("motions", circle[0], "next"),
+                f"motions follow each other in a circle: {way}; remove one `next`",
+            )
 
     def _circles(self) -> Iterator[list[str]]:
         """Yield the names of the motions of each circle of `next`, starting with the first one in the
@@ -539,4 +542,4 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         named = {joint for motion in self._motions for step in motion.steps for joint in step.pose}
         moved = [each for each, out in zip(joints, self._out, strict=True) if each in named and not out]
         missed = [each for each, was in zip(joints, self._missed, strict=True) if each in named and was]
-        return moved, f"{text}, without {', '.join(missed)} for want of torque" if missed else text
+        return moved, f"{text}, without {', '.join(missed)} (no torque)" if missed else text

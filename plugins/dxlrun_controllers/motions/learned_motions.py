@@ -75,8 +75,8 @@ class LearnedMotions:
         size = _HEAD.size + motions * (_ENTRY.size + joints * (8 + 4 * rows))
         if size > _MOST_KEPT:
             raise ValueError(
-                f"{motions} motions of {rows} cycles are {size} bytes, and {_MOST_KEPT} can be kept; "
-                "lower motions or longest"
+                f"{motions} motions of {rows} cycles are {size} bytes, more than {_MOST_KEPT}; "
+                "lower `motions` or `longest`"
             )
         self._motions = motions
         self._period_ns = period_ns
@@ -158,11 +158,11 @@ class LearnedMotions:
         """
         form, period_ns, joints, count = _HEAD.unpack_from(data)
         if form != _FORM:
-            raise ValueError("it is of another version")
+            raise ValueError("they have another version")
         if period_ns != self._period_ns:
-            raise ValueError(f"its period was {period_ns} ns and is {self._period_ns} ns")
+            raise ValueError(f"they have a period of {period_ns} ns instead of {self._period_ns} ns")
         if joints != len(self._most):
-            raise ValueError(f"it has {joints} joints")
+            raise ValueError(f"they have {joints} joints")
         at = _HEAD.size
         for _ in range(count):
             low, high, rows, repetitions, first, best = _ENTRY.unpack_from(data, at)
@@ -173,7 +173,7 @@ class LearnedMotions:
             at += 4 * joints * rows
             known = bool(((delay_s >= 0) & (delay_s <= MOST_DELAY_S)).all()) and 0 <= best <= first
             if not known or not rows or not np.isfinite(table).all():
-                raise ValueError("its numbers are none that are learned")
+                raise ValueError("they have invalid numbers")
             if rows > self._tables.shape[2] or len(self._known) == self._motions:
                 continue
             place = self._free.pop(0)

@@ -71,7 +71,7 @@ class SampleParameters(JointsParameters):
         yield from super().mistakes()
         for joint, (lower, upper) in self.bounds.range.items():
             if not lower < upper:
-                what = f"the range of {joint} ends at {upper:g} rad, where it begins at {lower:g} rad"
+                what = f"the range of {joint} from {lower:g} rad to {upper:g} rad is empty"
                 yield ("bounds", "range", joint), f"{what}; write [lower, upper]"
 
     @property
@@ -207,7 +207,7 @@ class SamplePlayer(Controller[SampleParameters]):
         self._keep(data[_HEAD:])
         if len(self._pieces) > MOST_PIECES:
             self._pieces = []
-            goal.end(Outcome.ABORTED, f"its table came in more than {MOST_PIECES} pieces")
+            goal.end(Outcome.ABORTED, f"its table has more than {MOST_PIECES} pieces")
             self._begin_stop(time_ns)
             return
         self._total = sum(map(len, self._pieces)) // self._width
@@ -293,7 +293,7 @@ class SamplePlayer(Controller[SampleParameters]):
         if (beyond := ((states.position < lower) | (states.position > self._upper)) & valid).any():
             row = int(beyond.argmax())
             bounds = f"{lower[row]:.4g} to {upper[row]:.4g} rad"
-            return row, f"is at {states.position[row]:.4g} rad, outside of its range of {bounds}"
+            return row, f"is at {states.position[row]:.4g} rad, outside its range of {bounds}"
         if (beyond := states.temperature > self._hottest).any():
             row = int(beyond.argmax())
             return row, f"has {states.temperature[row]:g} deg C, more than {self._hottest:g}"
@@ -356,12 +356,15 @@ def _checked(rows: Rows, parameters: SampleParameters) -> Floats:
     """Return the rows of a command as an array, shape (rows, width); raises ValueError for an invalid row."""
     width, joints = parameters.width, parameters.joints
     if not rows:
-        raise ValueError("there is no row; give at least one")
+        raise ValueError("the table has no rows; give at least one")
     for number, row in enumerate(rows, 1):
         if len(row) != width:
-            speeds = " and as many speeds" if width > len(joints) else ""
+            speeds = ", and as many speeds" if width > len(joints) else ""
             names = ", ".join(joints)
-            raise ValueError(f"{len(row)} numbers in row {number} for {len(joints)} joints ({names}){speeds}")
+            raise ValueError(
+                f"row {number} has {len(row)} numbers; give one for each of {len(joints)} joints "
+                f"({names}){speeds}"
+            )
     table = np.array(rows, dtype=np.float64)
     if parameters.command_interface in ("position", "posvel"):
         for column, joint in enumerate(joints):
@@ -370,7 +373,7 @@ def _checked(rows: Rows, parameters: SampleParameters) -> Floats:
             if beyond.any():
                 number = int(beyond.argmax())
                 raise ValueError(
-                    f"row {number + 1} sends {joint} to {table[number, column]:.4g} rad, outside of its "
+                    f"row {number + 1} moves {joint} to {table[number, column]:.4g} rad, outside its "
                     f"range of {lower:.4g} to {upper:.4g} rad"
                 )
     return table

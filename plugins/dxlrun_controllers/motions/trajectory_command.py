@@ -192,7 +192,7 @@ def flat_trajectory(
         index = int(stalled[0]) + 1
         raise ValueError(
             f"the times of a trajectory must grow: point {index + 1} is at {times[index]:g} s, "
-            f"the one before at {times[index - 1]:g} s"
+            f"the previous point at {times[index - 1]:g} s"
         )
     named = joints if command.joints is None else command.joints
     columns = _columns(named, joints)
@@ -232,7 +232,7 @@ def _goal_limits(command: TrajectoryCommand, named: tuple[str, ...], joints: tup
     given = {"path_tolerance": command.path_tolerance or {}, "goal_tolerance": command.goal_tolerance or {}}
     for key, tolerances in given.items():
         if unknown := [joint for joint in tolerances if joint not in named]:
-            raise ValueError(f"{key} names {unknown[0]}, which is not moved ({', '.join(named)})")
+            raise ValueError(f"{key} names {unknown[0]}, but the moved joints are {', '.join(named)}")
 
     def row(key: str, quantity: str) -> Floats:
         found = {joint: getattr(one, quantity) for joint, one in given[key].items()}

@@ -52,7 +52,7 @@ class BatteryParameters(ParametersModel):
         """Yield `stop` if it is not below `warn`, and names that are not states of an owner."""
         yield from super().mistakes()
         if self.stop >= self.warn:
-            yield ("stop",), "stop is not below warn; the warning comes first"
+            yield ("stop",), "stop is not below warn; lower stop, or raise warn"
         if self.current is not None and "/" not in self.current:
             yield ("current",), f"{self.current} is not a state; write OWNER/current"
         for index, name in enumerate(self.voltages):
@@ -151,6 +151,6 @@ class BatteryStateBroadcaster(Controller[BatteryParameters]):
         if not self._silent and time_ns - self._heard_ns > timeout:
             self._silent = True
             self.context.say(
-                f"no voltage of {', '.join(self.parameters.voltages)} for {timeout * 1e-9:g} s: "
-                "an empty battery would not be seen"
+                f"no voltage from {', '.join(self.parameters.voltages)} for {timeout * 1e-9:g} s: "
+                "an empty battery is not detected"
             )

@@ -47,7 +47,7 @@ class FallParameters(ParametersModel):
         yield from super().mistakes()
         for name, (lower, upper) in (("roll", self.roll), ("pitch", self.pitch)):
             if not lower < 0 < upper:
-                what = f"{name} is from an angle below 0 to one above"
+                what = f"the range of {name} does not enclose 0"
                 yield (name,), f"{what}; write for example [-45 deg, 45 deg]"
 
 
@@ -116,8 +116,8 @@ class FallReflex(Controller[FallParameters]):
 
     def _report_silence(self) -> None:
         parameters = self.parameters
-        silence = f"no orientation of {parameters.imu} for {parameters.timeout * 1e-9:g} s"
+        silence = f"no orientation from {parameters.imu} for {parameters.timeout * 1e-9:g} s"
         if parameters.on_silence == "activate" and not self._fallen:
             self.context.take_over(parameters.activate, silence)
         else:
-            self.context.say(f"{silence}: a fall would not be seen")
+            self.context.say(f"{silence}: falls are not detected")

@@ -84,10 +84,13 @@ class ImuBroadcasterParameters(ParametersModel):
         yield from super().mistakes()
         if self.orientation != "madgwick" and (self.magnetometer is not None or self.rest is not None):
             key = "rest" if self.magnetometer is None else "magnetometer"
-            yield (key,), "magnetometer and rest are for orientation: madgwick; write that, or remove them"
+            yield (
+                (key,),
+                "magnetometer and rest need orientation: madgwick; write that value, or remove the keys",
+            )
         if self.declination and self.magnetometer is None:
-            what = "declination is the angle from the magnetometer's north"
-            yield ("declination",), f"{what}; name a magnetometer, or remove it"
+            what = "declination needs a magnetometer"
+            yield ("declination",), f"{what}; name a magnetometer, or remove declination"
 
 
 class ImuSensorBroadcaster(Controller[ImuBroadcasterParameters]):
@@ -232,8 +235,8 @@ class ImuSensorBroadcaster(Controller[ImuBroadcasterParameters]):
         if not self._silent and self._times.age_s(time_ns) * 1e9 > timeout:
             self._silent = True
             self.context.say(
-                f"no new sample of {self.parameters.sensor} for {timeout * 1e-9:g} s: "
-                "the states stay as they were and become older"
+                f"no new sample from {self.parameters.sensor} for {timeout * 1e-9:g} s: "
+                "the states keep their last values"
             )
 
     def _is_finite(self, values: list[float], own: int) -> bool:

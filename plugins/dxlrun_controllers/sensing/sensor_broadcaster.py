@@ -67,16 +67,22 @@ class SensorParameters(ParametersModel):
         """Yield unknown fields of the message, values of the wrong type, and invalid names of states."""
         yield from super().mistakes()
         if self.cells and self.message != "WrenchStamped":
-            yield ("cells",), f"cells make a WrenchStamped, not a {self.message}; remove them"
+            yield ("cells",), f"cells are only for WrenchStamped, not {self.message}; remove cells"
         kinds = _numbers(self.message)
         for path, value in self.fields.items():
             if path not in kinds:
-                yield ("fields", path), f"{self.message} has no number {path}; it has {', '.join(kinds)}"
+                yield (
+                    ("fields", path),
+                    f"{self.message} has no numeric field {path}; use one of {', '.join(kinds)}",
+                )
             elif kinds[path] is int and not (isinstance(value, float) and value.is_integer()):
-                yield ("fields", path), f"{path} of {self.message} is a whole number; write one"
+                yield (
+                    ("fields", path),
+                    f"{path} of {self.message} must be a whole number, such as 1",
+                )
         states = self.weights
         if not any(states.values()):
-            yield (), "fields (or cells) name at least one state; write such as {range: sonar/range}"
+            yield (), "no field or cell names a state; write one, such as {range: sonar/range}"
         for path, weights in states.items():
             for name in weights:
                 if "/" not in name:
@@ -85,7 +91,7 @@ class SensorParameters(ParametersModel):
                         f"{name} is not a state; write OWNER/STATE, such as sonar/range",
                     )
             if self.cells and path in self.fields and path in _OF_CELLS:
-                yield ("fields", path), f"{path} follows from the cells; remove it from the fields"
+                yield ("fields", path), f"{path} is computed from the cells; remove it from the fields"
 
     @property
     def weights(self) -> dict[str, dict[str, float]]:

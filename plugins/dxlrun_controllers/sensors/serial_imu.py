@@ -69,11 +69,11 @@ class SerialImuParameters(ParametersModel):
     def _distinct(cls, columns: tuple[str, ...]) -> tuple[str, ...]:
         states = [column for column in columns if column != _IGNORED]
         if not states:
-            raise ValueError("no column is a state; name one at least")
+            raise ValueError("no column is a state; name at least one")
         if wrong := [state for state in states if not state or "/" in state or state == "age"]:
-            raise ValueError(f"{wrong[0]!r} is not a name of a state; write one such as angular_velocity.x")
+            raise ValueError(f"{wrong[0]!r} is not a valid state; write a name such as angular_velocity.x")
         if twice := [state for state in states if states.count(state) > 1]:
-            raise ValueError(f"{twice[0]} is there twice; name each state once")
+            raise ValueError(f"{twice[0]} occurs twice; name each state once")
         return columns
 
     @field_validator("scale")
@@ -81,7 +81,7 @@ class SerialImuParameters(ParametersModel):
     def _of_columns(cls, scale: dict[str, float], info: ValidationInfo) -> dict[str, float]:
         groups = {column.partition(".")[0] for column in info.data.get("columns", scale)} - {_IGNORED}
         if unused := [group for group in scale if group not in groups and "columns" in info.data]:
-            raise ValueError(f"no column is a state of {unused[0]}; there are {', '.join(sorted(groups))}")
+            raise ValueError(f"no column belongs to {unused[0]}; the groups are {', '.join(sorted(groups))}")
         return scale
 
 
@@ -167,9 +167,9 @@ class SerialImu(Sensor[SerialImuParameters]):
     def _report_garbage(self, t_ns: int) -> None:
         if self._garbage and t_ns - self._reported_ns >= _REPORT_NS:
             shown = self._shown[:60].decode("ascii", "backslashreplace")
-            count = "a line is" if self._garbage == 1 else f"{self._garbage} lines are"
+            count = "a line is not" if self._garbage == 1 else f"{self._garbage} lines are not"
             self.context.say(
-                f"{count} no sample of {len(self.parameters.columns)} numbers, the last one: {shown}"
+                f"{count} a sample of {len(self.parameters.columns)} numbers; last line: {shown}"
             )
             self._garbage, self._reported_ns = 0, t_ns
 

@@ -143,7 +143,7 @@ class SimulatedImu(Sensor[SimulatedImuParameters]):
         """Restart the noise from its seed. Raises RuntimeError without a simulated body."""
         super().open(context)
         if context.body is None:
-            raise RuntimeError("there is no simulated body")
+            raise RuntimeError(f"link {self.parameters.link} has no simulated body")
         self._body = context.body
         own, rate = self.parameters, 1e9 / context.period_ns
         self._generator = np.random.default_rng(own.seed)

@@ -117,7 +117,7 @@ def test_a_joint_that_leaves_its_range_ends_the_experiment_and_the_rest_is_kept(
 
     plays, done = stage.perform(stage.rig(stage.arm), "elbow", segments)
     assert "joint elbow is at 0.5" in done.why
-    assert "outside of its range of -0.5236 to 0.5236 rad" in done.why
+    assert "outside its range of -0.5236 to 0.5236 rad" in done.why
     assert [part.outcome for part in done.recorded] == ["reached", "aborted"]
     assert done.recorded[1].position.max() > 0.5236
     assert len(plays.got) == 1

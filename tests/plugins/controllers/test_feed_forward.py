@@ -213,12 +213,12 @@ def test_the_state_is_published_fifty_times_a_second() -> None:
 @pytest.mark.parametrize(
     ("parameters", "motors", "what"),
     [
-        ({}, (MOTOR, None), "there is a joint without a motor file"),
+        ({}, (MOTOR, None), "no motor file for "),
         ({}, (MOTOR, replace(MOTOR, p_gain=0)), "the P gain of a servo is declared as 0"),
         (
             {"command_interface": "effort", "pass_on": True},
             (MOTOR, MOTOR),
-            "pass_on is for a controller below",
+            "pass_on needs the key `into`",
         ),
     ],
 )

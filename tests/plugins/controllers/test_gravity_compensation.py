@@ -245,21 +245,29 @@ JOINTS = "    type: gravity_compensation\n    joints: [shoulder, elbow]\n"
 @pytest.mark.parametrize(
     ("change", "at", "what"),
     [
-        (("yaml", "\nmodel: {urdf: urdf/held_arm.urdf}", ""), "gravity", "needs the robot's URDF"),
-        (("urdf", '"elbow" type="revolute"', '"knee" type="revolute"'), "elbow", "needs elbow in the URDF"),
-        (("urdf", '"elbow" type="revolute"', '"elbow" type="fixed"'), "elbow", "where it is fixed"),
-        (("urdf", '"elbow" type="revolute"', '"elbow" type="prismatic"'), "elbow", "the URDF to turn elbow"),
+        (("yaml", "\nmodel: {urdf: urdf/held_arm.urdf}", ""), "gravity", "needs a URDF"),
+        (
+            ("urdf", '"elbow" type="revolute"', '"knee" type="revolute"'),
+            "elbow",
+            "needs elbow, but the URDF lacks it",
+        ),
+        (("urdf", '"elbow" type="revolute"', '"elbow" type="fixed"'), "elbow", "but it is fixed in the URDF"),
+        (
+            ("urdf", '"elbow" type="revolute"', '"elbow" type="prismatic"'),
+            "elbow",
+            "needs elbow to turn, but it is prismatic",
+        ),
         (
             ("yaml", LIMITS, "{position: [0 mm, 5 mm], velocity: 5 mm/s}\n    travel_per_turn: 20 mm\n"),
             "shoulder",
-            "needs the URDF to slide shoulder, where it is revolute",
+            "needs shoulder to slide, but it is revolute in the URDF",
         ),
-        (("urdf", '<mass value="0.15"/>', ""), "shoulder", "the mass of forearm, which shoulder moves"),
-        (("urdf", "0.15", "-1"), "gravity", "link forearm has the mass -1"),
+        (("urdf", '<mass value="0.15"/>', ""), "shoulder", "the mass of forearm, moved by shoulder"),
+        (("urdf", "0.15", "-1"), "gravity", "the mass of link forearm is -1, not a number"),
         (
             ("yaml", JOINTS, f"{JOINTS}    payload: {{link: hnad, mass: 1 kg}}\n"),
             "hnad",
-            "it has base_link, upper_arm, forearm, hand",
+            "use one of base_link, upper_arm, forearm, hand",
         ),
         (("yaml", JOINTS, f"{JOINTS}    payload: {{link: base_link, mass: 1 kg}}\n"), "base_link", "none of"),
         (("yaml", JOINTS, f"{JOINTS}    payload: {{link: hand, mass: 1}}\n"), "1}}", "has no unit"),
@@ -297,4 +305,4 @@ def test_a_joint_without_a_weight_is_refused(refused: Callable[..., list[str]], 
     for mass in ('"0.15"', '"0.25"'):
         refused("urdf", mass, '"0"')
     (line,) = refused()
-    assert "gravity has nothing to hold at elbow, which moves no mass in the URDF" in line
+    assert "gravity has nothing to hold at elbow: it moves no mass in the URDF" in line

@@ -93,7 +93,7 @@ def test_the_error_falls_tenfold_in_ten_repetitions(interface: str) -> None:
     assert max(errors[5:]) < errors[0] / 8
     assert [message.repetition for _, message in learner.stage.messages] == list(range(11))
     assert learner.stage.said == [
-        f"motion {learner.stage.messages[0][1].motion} is not known: it is played without a correction"
+        f"motion {learner.stage.messages[0][1].motion} is not learned yet: no correction"
     ]
 
 
@@ -264,7 +264,7 @@ def test_a_motion_that_begins_while_the_one_before_is_learned() -> None:
     learner.stage.controller._repetition._step = 16
     errors = [learner.repeat(rest_s=0.1, start_in=0.1) for _ in range(8)]
     assert errors[-1] < errors[1] / 5, "the first is reported with the second"
-    assert any("the one before is still being learned" in text for text in learner.stage.said)
+    assert any("the previous repetition is still being learned" in text for text in learner.stage.said)
 
 
 # Motions
@@ -306,7 +306,7 @@ def test_each_motion_has_its_own_correction_and_the_oldest_is_forgotten() -> Non
     assert learner.repeat(0.0) < 0.6
     assert learner.repeat(1.0) < 0.6
     assert learner.repeat(2.0) > 2.0, "a changed motion begins anew"
-    assert learner.stage.said[-1].endswith("takes its place")
+    assert " is dropped for motion " in learner.stage.said[-1]
     assert learner.repeat(1.0) < 0.6
     assert learner.repeat(0.0) > 2.0, "it was forgotten"
 
@@ -413,13 +413,13 @@ def test_another_period_begins_anew_and_says_so() -> None:
     other = data[:4] + (10_000_000).to_bytes(8, "little") + data[12:]
     again = Learner(kept=other)
     assert again.stage.said == [
-        "what was learned before cannot be used: its period was 10000000 ns and is 20000000 ns"
+        "the stored corrections cannot be used: they have a period of 10000000 ns instead of 20000000 ns"
     ]
     assert again.stage.controller._known._known == []
 
 
 def test_more_than_can_be_kept_is_refused() -> None:
-    with pytest.raises(ValueError, match="lower motions or longest"):
+    with pytest.raises(ValueError, match="lower `motions` or `longest`"):
         Stage(IlcController, {"joints": ["a", "b"], "longest": "3000 s"})
 
 

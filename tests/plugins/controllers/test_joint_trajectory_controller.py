@@ -381,7 +381,7 @@ def test_a_splice_where_nothing_is_played_begins_at_once_and_one_that_is_too_fas
     np.testing.assert_allclose(seen(robot, (2.4, 2.5, 3.0))[:, 0], [0.9, 0.8, 0.8 - 1 / 2 / DECELERATION])
     outcome, told, *_ = robot.goal.ended[0]
     assert outcome is Outcome.ABORTED
-    assert told.startswith("joint a has 0.5 to go to the first point in 0.1 s, at 9.819 a second")
+    assert told.startswith("joint a needs 9.819 a second to the first point, 0.5 away in 0.1 s")
 
 
 def test_a_splice_after_the_end_of_the_one_before_is_waited_for_and_played():
@@ -480,7 +480,7 @@ def test_a_chunk_takes_the_place_of_a_goal_for_its_joints_and_a_goal_that_of_a_c
     robot = moving(TWO, to=(1.3, 0.8))
     robot.update(0.5)
     chunk(robot, 0.5, [0.7, 0.8], [0.3, 0.3], joints=["b"])
-    told = "after 0.500 s, a chunk of positions took its place"
+    told = "after 0.500 s, replaced by a chunk of positions"
     assert robot.goal.ended == [(Outcome.PREEMPTED, told, "a", pytest.approx(0, abs=1e-9))]
     np.testing.assert_allclose(seen(robot, (0.8, 1.0, 2.0)), [[1.1, 0.3], [1.3, 0.3], [1.3, 0.3]])
     chunk(robot, 2.0, [3.0], [[0.0, 0.0]])
@@ -555,7 +555,7 @@ def test_a_goal_that_takes_longer_than_its_time_out_is_missed_and_the_joints_sto
     outcome, told, joint, _ = robot.goal.ended[0]
     assert (outcome, joint) == (Outcome.MISSED, "a")
     assert told.startswith("joint a is ")
-    assert told.endswith(" deg off; after 0.520 s, its time-out")
+    assert told.endswith(" deg off; timeout after 0.520 s")
     assert position == pytest.approx(0.3 if not speed else 0.82 + 1 / 2 / DECELERATION)
 
 
@@ -584,7 +584,7 @@ def test_a_timed_out_goal_is_judged_by_its_last_point():
     robot = started(ONE | {"speed": 0.0})
     robot.send(0.0, "trajectory", timeout=0.5, points=one(1.3))
     seen(robot, (0.4, 0.52))
-    told = "joint a is 57.30 deg off; after 0.520 s, its time-out"
+    told = "joint a is 57.30 deg off; timeout after 0.520 s"
     assert robot.goal.ended == [(Outcome.MISSED, told, "a", pytest.approx(1.0))]
 
 
@@ -592,7 +592,7 @@ def test_a_goal_that_times_out_before_its_splice_names_no_joint():
     robot = moving()
     robot.send(0.2, "trajectory", splice=True, start_in=0.6, timeout=0.3, points=one(0.3))
     seen(robot, (0.3, 0.5, 0.52))
-    told = "after 0.320 s, its time-out, before its start"
+    told = "timeout after 0.320 s, before its start"
     assert [end[:3] for end in robot.goal.ended] == [(Outcome.MISSED, told, "")]
 
 
@@ -657,8 +657,8 @@ def test_the_way_to_the_first_point_is_judged_by_its_peak():
     robot = started(ONE, limits={"velocity": 2.0})
     there = [{"time": 0.5, "positions": [1.1], "velocities": [0.0]}]
     robot.send(0.0, "trajectory", points=there)
-    told = "joint a has 0.8 to go to the first point in 0.5 s, at 2.4 a second, more than its limit of 2"
-    assert robot.goal.ended[0][1].startswith(f"{told}: give the point 0.6 s or more")
+    told = "joint a needs 2.4 a second to the first point, 0.8 away in 0.5 s, more than its limit of 2"
+    assert robot.goal.ended[0][1].startswith(f"{told}; give the point 0.6 s or more")
     robot.send(0.1, "trajectory", points=[there[0] | {"time": 0.6}])
     assert robot.goal.outcome is None
 

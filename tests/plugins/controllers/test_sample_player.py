@@ -86,7 +86,7 @@ def test_too_many_pieces_abort_their_goal_and_no_more(player: Any) -> None:
     for _ in range(MOST_PIECES):
         stage.send(0.0, "rows", rows=ROWS[:1])
     stage.send(0.0, "samples", period=0.02, rows=ROWS)
-    assert stage.goal.ended[0][:2] == (Outcome.ABORTED, "its table came in more than 256 pieces")
+    assert stage.goal.ended[0][:2] == (Outcome.ABORTED, "its table has more than 256 pieces")
     stage.send(0.1, "samples", period=0.02, rows=ROWS)
     assert stage.update(0.1).tolist() == ROWS[0]
     assert not stage.goal.ended
@@ -109,7 +109,7 @@ def test_rows_of_a_deactivated_player_are_forgotten(player: Any, fault: bool) ->
         (
             {"range": {"b": ("-0.5 rad", "0.5 rad")}},
             ("position", 0.6),
-            "joint b is at 0.6 rad, outside of its range of -0.5 to 0.5 rad",
+            "joint b is at 0.6 rad, outside its range of -0.5 to 0.5 rad",
         ),
         ({"temperature": 60.0}, ("temperature", 61.0), "joint b has 61 deg C, more than 60"),
         ({"effort": {"b": 1.0}}, ("effort", -1.5), "joint b exerts 1.5, more than 1"),

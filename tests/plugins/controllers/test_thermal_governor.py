@@ -151,8 +151,8 @@ def test_what_fits_is_accepted(tmp_path: Path, change: tuple[str, str]) -> None:
 @pytest.mark.parametrize(
     ("change", "at", "what"),
     [
-        ((f", {PARTS}", ""), "j]", "does not know at which error j gives all its torque; write reach"),
-        ((PARTS, f"{PARTS}, limit: 80"), "80", "lets j become 80 deg C hot, but its XM430-W350 cuts"),
+        ((f", {PARTS}", ""), "j]", "needs the error for the full torque of j; write reach"),
+        ((PARTS, f"{PARTS}, limit: 80"), "80", "has 80 deg C as limit of j, but the XM430-W350 cuts"),
         (("direction: 1", "direction: 1, registers: {temperature_limit: 60}"), "", ""),
         ((PARTS, f"{PARTS}, limit: {{j: 95}}"), "{j: 95}", "beyond 80; write limit: 75 at most"),
         ((PARTS, f"{PARTS}, warn: 75"), "75", "warn of j at 75 deg C, not below its limit of 75"),
@@ -167,7 +167,7 @@ def test_what_does_not_fit_is_one_sentence_at_its_place(
     path.write_text(ROBOT.replace(*change))
     if not what:  # thresholds go with the servo's own limit
         path.write_text(path.read_text().replace(PARTS, f"{PARTS}, limit: 70"))
-        at, what = "70", "lets j become 70 deg C hot, but its XM430-W350 cuts its torque beyond 60"
+        at, what = "70", "has 70 deg C as limit of j, but the XM430-W350 cuts torque beyond 60"
     with pytest.raises(InputError) as caught:
         compile_files(path, {}, [])
     (found,) = [text for text in str(caught.value).splitlines() if what in text]

@@ -89,7 +89,7 @@ def test_without_a_fresh_voltage_nothing_is_decided_and_an_event_says_so(
     voltage: float, age_s: float
 ) -> None:
     bench = Bench().measure(12.0).measure(voltage, seconds=10.0, age_s=age_s)
-    assert bench.stage.said == ["no voltage of power/voltage for 2 s: an empty battery would not be seen"]
+    assert bench.stage.said == ["no voltage from power/voltage for 2 s: an empty battery is not detected"]
     assert not bench.stage.endings
     assert math.isnan(bench.stage.context.provided[0])
 

@@ -280,12 +280,12 @@ def test_a_lost_reply_is_made_up_for_and_a_lost_servo_is_reported():
     for _ in range(20):
         robot.states.position[1] += 0.1
         robot.step()
-    assert robot.said == ["odometry holds: no reply of l"]
+    assert robot.said == ["odometry holds: no reply from l"]
     assert robot.controller._pose.x == pytest.approx(0.3 * RADIUS)
     robot.states.valid[0] = True
     robot.states.position[0] -= 12.0  # it has rebooted and counts from another turn
     robot.step()
-    assert robot.said[1] == "odometry continues without the distance of 0.42 s with missing replies"
+    assert robot.said[1] == "odometry lacks the distance of 0.42 s without replies"
     robot.states.position[:] += 0.1
     robot.step()
     assert robot.controller._pose.x == pytest.approx(0.4 * RADIUS)

@@ -114,7 +114,7 @@ def test_it_counts_once_a_fall_and_again_after_a_time_upright() -> None:
 def test_an_old_orientation_does_not_trigger_it() -> None:
     bench = Bench().tip(0.0, cycles=5).tip(90.0, cycles=2).tip(90.0, cycles=50, age_s=0.21)
     assert not bench.count
-    assert bench.stage.said == ["no orientation of imu for 0.2 s: a fall would not be seen"]
+    assert bench.stage.said == ["no orientation from imu for 0.2 s: falls are not detected"]
     assert bench.tip(90.0, cycles=3).count == 0  # counted anew
     assert bench.tip(90.0).count == 1
 
@@ -124,13 +124,13 @@ def test_silence_may_let_them_take_over_too(q: tuple[float, ...]) -> None:
     bench = Bench(on_silence="activate").see(q, cycles=9)
     assert not bench.count
     bench.see(q, cycles=50)
-    assert bench.stage.takeovers == [(("curl",), "no orientation of imu for 0.2 s")]
+    assert bench.stage.takeovers == [(("curl",), "no orientation from imu for 0.2 s")]
 
 
 def test_zeros_are_no_orientation_and_the_length_of_a_quaternion_does_not_matter() -> None:
     bench = Bench().tip(0.0, cycles=5).see((0.0, 0.0, 0.0, 0.0), cycles=30)
     assert not bench.count
-    assert bench.stage.said == ["no orientation of imu for 0.2 s: a fall would not be seen"]
+    assert bench.stage.said == ["no orientation from imu for 0.2 s: falls are not detected"]
     for scale in (0.01, 100.0):
         fallen = Bench().see(tuple(scale * one for one in turned(30.0, 0.0, 41.0)), cycles=10)
         assert fallen.stage.takeovers == [(("curl",), "falls with roll 41 deg, pitch 0 deg")]

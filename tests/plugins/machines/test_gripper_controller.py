@@ -96,7 +96,7 @@ def test_what_neither_arrives_nor_stalls_is_missed():
         robot.states.position[0] = 0.03 * (n // 5 % 2)
         robot.step()
     assert goal.outcome is Outcome.MISSED
-    assert goal.text == "not there after 1 s at 0.03 rad, 39.03 mm"
+    assert goal.text == "goal not reached after 1 s at 0.03 rad, 39.03 mm"
     assert goal.error == pytest.approx(0.57)
 
 
@@ -134,7 +134,7 @@ def test_a_silent_servo_is_no_stall_but_missed():
     robot.steps(49)
     assert goal.outcome is None
     robot.steps(2)
-    assert (goal.outcome, goal.text[:22]) == (Outcome.MISSED, "no reply of its servo ")
+    assert (goal.outcome, goal.text[:24]) == (Outcome.MISSED, "no reply from its servo ")
 
 
 def test_a_cancel_holds_and_ends_at_rest():

@@ -103,9 +103,7 @@ def test_a_silent_sensor_is_reported_once_and_the_filter_begins_anew() -> None:
         bench.sample((0.0, 0.0, 1.0), LEVEL)
     for cycle in range(1, 31):
         bench.sample((0.0, 0.0, 1.0), LEVEL, age_s=cycle * 0.02)
-    assert bench.stage.said == [
-        "no new sample of chip for 0.2 s: the states stay as they were and become older"
-    ]
+    assert bench.stage.said == ["no new sample from chip for 0.2 s: the states keep their last values"]
     bench.sample(
         (9.0, 9.0, 9.0), (0.0, G, 0.0)
     )  # it lies on its side now; no rate is integrated over the gap

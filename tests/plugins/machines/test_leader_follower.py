@@ -83,14 +83,14 @@ def test_a_silent_leader_is_reported_once_and_all_hold_until_it_is_back(silence)
         robot.step()
         np.testing.assert_array_equal(robot.commands.position, held)
     (sentence,) = robot.said
-    assert sentence.startswith("no reply of leader m")
+    assert sentence.startswith("no reply from leader m")
     assert sentence.endswith("holding")
     lead(robot, 0.4, 1.0)
     robot.step()  # softly again
     np.testing.assert_allclose(robot.commands.position, [0.0, held[1] + 0.02], atol=1e-12)
     robot.context.reads[4] = 0.3
     robot.step()
-    assert robot.said[1] == "no reply of leader l for 0.30 s, holding"
+    assert robot.said[1] == "no reply from leader l for 0.30 s, holding"
 
 
 def test_after_a_lost_joint_is_back_it_starts_softly_from_what_was_sent():
