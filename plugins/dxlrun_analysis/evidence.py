@@ -35,7 +35,7 @@ same effect if its goals or replies are mixed into those of this run."""
 _UNANSWERED = frozenset(("servo_lost", "silent"))
 """Codes of failures inferred from missing replies, which a busy machine can also cause."""
 _FAILED = _UNANSWERED | {"servo_rebooted", "torque_lost"}
-_SHARED = "Check what these buses share: the USB hub, its driver, the supply."
+_SHARED = "Check the USB hub, driver and supply that these buses share."
 _MARGIN = 0.1
 """A finding is kept on a busy machine if its share of late replies exceeds the busy share of the run by
 this: it then has another cause."""
@@ -71,7 +71,7 @@ def busy_machine(totals: RunTotals) -> list[str]:
         ]
     if parts and totals.causes.throttled:
         hot = counted(totals.causes.throttled, "second", "seconds")
-        parts.append(f"the processor was hot and slow for {hot}")
+        parts.append(f"heat throttled the processor for {hot}")
     return parts
 
 
@@ -204,9 +204,9 @@ def _names(subject: str, totals: RunTotals) -> dict[str, str]:
 def wake_up_remedy(real_time: RealTime) -> str:
     """Return a sentence with the next step towards punctual wake-ups: scheduler, kernel or machine."""
     if not real_time.requested:
-        return "`loop: {scheduler: {policy: round_robin}}` in the robot file helps."
+        return "Write `loop: {scheduler: {policy: round_robin}}` into the robot file."
     if not real_time.granted:
-        return "The real-time scheduler that the robot file asks for was not granted, and would help."
+        return "The requested real-time scheduler was not granted: run `dxlrun doctor`."
     if not real_time.kernel:
-        return "The real-time scheduler was granted; a real-time kernel helps."
-    return "Scheduler and kernel are real-time ones, so it is the machine: see `dxlrun doctor`."
+        return "The real-time scheduler was granted: install a real-time kernel."
+    return "Scheduler and kernel are real-time: check the machine with `dxlrun doctor`."

@@ -39,9 +39,7 @@ CODES = {
     EventCode.SERVO_LOST: "servo_lost",
     EventCode.SERVO_LIMP: "torque_lost",
 }
-_REFUSED = (
-    "`dxlrun servo PORT ID get` prints what it has; it takes part again when that is as in the robot file."
-)
+_REFUSED = "Restore the values of the robot file; `dxlrun servo PORT ID get` prints those of the servo."
 _CABLES = re.compile(r"\?.*")
 _FEWEST_OF_BUS = 2  # A single servo does not show a common cause
 _AT_ONCE_NS = 500_000_000  # Failures within half a second are simultaneous
@@ -82,9 +80,9 @@ def lost_servos(totals: RunTotals) -> Iterable[Finding]:
     rebooted = first == EventCode.SERVO_REBOOTED
     fix = _REFUSED if ordered[0][0] in totals.returns else ""
     if _failed_together(totals, by_source):
-        sentence += f" It was at once, while others of their bus {'ran on' if rebooted else 'answered'}: "
+        sentence += f" They failed at once, while other servos {'ran on' if rebooted else 'answered'}: "
         sentence += "they share a supply or a cable."
-        fix = "Look at the cable, the plug or the fuse that they share, between them and the others."
+        fix = "Check the cable, the plug and the fuse between them and the other servos."
     yield Finding(CODES[first], ordered[0][0], sentence, fix, Rank.SERVO)
 
 
@@ -131,12 +129,12 @@ def whole_buses(totals: RunTotals) -> Iterable[Finding]:
             silent[bus] = t_ns
     if len(silent) > 1 and max(silent.values()) - min(silent.values()) <= _AT_ONCE_NS:
         named = _joined(tuple(silent))
-        what = f"All servos of buses {named} were lost at once: it is what these buses share."
+        what = f"All servos of buses {named} were lost at once: the cause is common to them."
         yield Finding("servo_lost", "machine", what, rank=Rank.SERVO_CAUSE)
         return
     for bus in silent:
         count = sum(servo.bus == bus for servo in servos)
-        what = f"All {count} servos of bus {bus} were lost at once: it is not one of them."
+        what = f"All {count} servos of bus {bus} were lost at once: the cause is not a single servo."
         fix = "Check the adapter, the first cable and the supply of the bus."
         yield Finding("servo_lost", bus, what, fix, Rank.SERVO_CAUSE)
 
@@ -167,8 +165,8 @@ def invalid_states(totals: RunTotals) -> Iterable[Finding]:
     ordered = sorted((joint in waited, -count / cycles, joint) for joint, count in counts.items())
     named = ", ".join(f"{joint} in {-share:.1%}" for _, share, joint in ordered[:_MOST_NAMED])
     more = _more(", and", len(ordered), "more joint", "more joints")
-    behind = f", {len(waited)} of them because replies before theirs were missing" if waited else ""
-    sentence = f"States were invalid: {named} of the cycles{more}{behind}; {INVALID_SHARE:.0%} tolerated."
+    behind = f", {len(waited)} of these joints because a preceding reply was missing" if waited else ""
+    sentence = f"States were invalid: {named} of the cycles{more}{behind}; {INVALID_SHARE:.0%} is tolerated."
     share = max(counts.values()) / cycles
     subject = ordered[0][2] if len(waited) < len(counts) else totals.bus_of(ordered[0][2])
     yield Finding("invalid_states", subject, sentence, rank=Rank.SHARE, share=share)

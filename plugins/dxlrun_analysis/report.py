@@ -135,7 +135,7 @@ def facts(log: Log, report: Report) -> tuple[Table, ...]:
 
 _SCHEDULES: dict[ScheduleName, str] = {
     "absolute": "",
-    "sequential": "sequential: a cycle is due one period after the one before began, so delays add up",
+    "sequential": "sequential: each cycle is due one period after the start of the last, so delays add up",
 }
 
 
@@ -163,7 +163,7 @@ def _run(log: Log, report: Report) -> Iterator[tuple[str, Value]]:
 
 def _bus(bus: LoggedBus | None) -> str:
     if bus is None or not bus.protocol:
-        return "nothing more is known"
+        return "no details in the log"
     models = sorted({servo.model or "?" for servo in bus.servos})
     return (
         f"port {bus.port or '?'}, Protocol {bus.protocol:.1f}, {bus.baud_rate / 1e6:g} Mbit/s, "

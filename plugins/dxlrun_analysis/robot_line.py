@@ -37,7 +37,7 @@ _REASONS = {
     "servo_error": "{subject} reported errors",
     "errors_logged": "{text}",
     "invalid_states": "states of {subject} were often invalid",
-    "log_not_whole": "the log is not whole",
+    "log_not_whole": "the log is incomplete",
 }
 """Reason in the first line by the code of a finding; for all others the code itself (`stood still`).
 Missed goals have a clause of their own."""
@@ -88,7 +88,7 @@ def _failures(totals: RunTotals) -> Iterator[str]:
     fallen = next((one for one in conduct.takeovers if one.fell), None)
     if conduct.lies or fallen:
         at = f" at {fallen.time_s:.1f} s" if fallen else ""
-        yield f"it fell{at} and {'lies' if conduct.lies else 'got up'}"
+        yield f"the robot fell{at} and {'did not get up' if conduct.lies else 'got up'}"
     severe = [group for group in totals.events if group.severity >= Severity.ERROR]
     gone = {group.source: group for group in severe if group.code == EventCode.PORT_LOST}
     for bus, group in gone.items():
@@ -127,7 +127,7 @@ def _at(t_ns: int, begin_ns: int) -> str:
 def _goals_not_reached(totals: RunTotals) -> Iterator[str]:
     for report in totals.conduct.goals.failed[:_MOST_NAMED]:
         if report.cut:
-            yield f"the run ended before {_goal(report)} did"
+            yield f"the run ended before the end of {_goal(report)}"
         else:
             status = "missed its goal" if report.status == "missed" else report.status
             joint = totals.plan.joint(report.joint)
@@ -177,7 +177,7 @@ def _played(totals: RunTotals) -> str:
         return f"played {listed(files)} ({counted(motions, 'motion', 'motions')}){within}"
     sent = [act for act in totals.acts if act.origin != "loop" and not act.refusal and act.what]
     if totals.conduct.goals.counts or any(act.set_points for act in sent):
-        return f"moved by commands from outside{within}"
+        return f"moved by clients{within}"
     ran = "the log has" if totals.damage else "ran for"
     return f"{ran} {totals.periods.seconds:.1f} s without a motion" if totals.periods.records else ""
 

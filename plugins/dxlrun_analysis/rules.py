@@ -44,101 +44,99 @@ RULES: Mapping[str, Rule] = {
     # Lines
     "bus_lost": Rule(
         "bus",
-        "the system reports that the port is gone",
+        "loss of the port, reported by the system",
         "once",
         "Check the adapter's plugs and cable; `dmesg` shows what the system reported.",
     ),
     "power_lost": Rule(
         "bus",
         "all servos of a bus rebooted",
-        "within 0.5 s, two servos or more",
+        "two servos or more within 0.5 s",
         "Check the supply, its plug and its switch.",
     ),
     "another_host": Rule(
         "bus",
-        "instructions on the line that this run did not send, replies that it did not ask for, or its own "
-        "instructions that come back",
-        "three instructions (of 256 checksums of noise one fits), one that writes items of a servo, or ten "
-        "replies",
-        "Stop the other program (`fuser {port}` shows it), or unplug the other adapter; where own "
-        "instructions come back, check what switches the adapter's direction.",
+        "instructions from another sender, unrequested replies, or echoes of its own instructions",
+        "three instructions (noise has the right checksum once in 256 times), one write of servo items, or "
+        "ten replies",
+        "Stop the other program (`fuser {port}` shows it), or unplug the other adapter; for "
+        "echoes, check the direction control of the adapter.",
         Needs.LOG,
     ),
     "late_replies": Rule(
-        "bus, or the machine where several buses are late at once",
-        "how much later replies come than wire, return delay and adapter need",
-        "2 ms, in a tenth of the exchanges or after they were given up; 12 to 18 ms are a timer of 16 ms",
+        "bus, or the machine if several buses are late at once",
+        "delay of replies beyond the times of wire, return delay and adapter",
+        "2 ms, in a tenth of the exchanges or in five replies after the timeout; 12 to 18 ms indicate a "
+        "latency timer of 16 ms",
         "Check adapter, driver and USB hub.",
         _REPLIES,
     ),
     "noise": Rule(
         "bus",
-        "bytes that belong to no packet",
-        "after 0.5 % of the instructions, and ten: a plug that is moved makes fewer",
-        "Check its shield, ground and termination; unplug one servo after the other to find one that sends "
-        "unasked.",
+        "stray bytes, outside of any packet",
+        "after 0.5 % of the instructions, and at least ten: moving a plug causes fewer",
+        "Check its shield, ground and termination; unplug one servo after the other to find the source.",
         Needs.LOG,
     ),
     "lossy_line": Rule(
-        "bus, or the machine where several buses lose replies at once",
-        "occasions at which no servo of a bus answered, and those that are spread evenly over its servos",
-        "five, and half of the occasions of the bus; of several buses 60 % of theirs",
+        "bus, or the machine if several buses lose replies at once",
+        "losses of all servos of the bus at once, or spread evenly over its servos",
+        "five, and half of the losses of the bus; for several buses, 60 % of the losses of each",
         "Check adapter, plugs, termination, ground and the cable's length, or lower baud_rate.",
         _REPLIES,
     ),
     # Servos
     "servo_lost": Rule(
         "servo, or the bus that lost all of its servos at once",
-        "the loop lost it: no reply to three reads, and to those of half a second",
-        "once; together with others: within 0.5 s",
-        "Check its cable, plugs and supply, at that angle, too; `dxlrun scan {port}` shows which servos "
-        "answer.",
+        "lost by the loop: three missing replies in a row, and none for 50 ms",
+        "once; for several servos together: within 0.5 s",
+        "Check its cable, plugs and supply, also at the angle of the loss; `dxlrun scan {port}` lists the "
+        "servos with an answer.",
     ),
     "servo_rebooted": Rule(
         "servo",
         "a register that only a reboot resets",
-        "once, unless a client asked for it",
+        "once, unless requested by a client",
         "Check its plugs, and whether the supply can give the current.",
     ),
     "torque_lost": Rule(
         "servo",
         "Torque Enable is 0 without a request",
         "once",
-        "Look for overload, heat, low voltage: `dxlrun servo {port} {servo_id} get` has its errors.",
+        "Look for overload, heat, low voltage: `dxlrun servo {port} {servo_id} get` prints its errors.",
     ),
     "slow_servo": Rule(
         "servo",
-        "its own part of its reply time, compared with the other servos of its bus",
+        "its reply time without preceding replies and wire time, compared with the other servos of its bus",
         "100 us later in three quarters of its replies; or five replies 300 us later, ten times as many as "
-        "all others have (by chance once in 1000 runs)",
-        "Compare its Return Delay Time and firmware with those of the others "
+        "all other servos together (by chance once in 1000 runs)",
+        "Compare its Return Delay Time and firmware with those of other servos "
         "(`dxlrun servo {port} {servo_id} get`), and check its supply.",
         _REPLIES,
     ),
     "lossy_servo": Rule(
         "servo, or servos that lose replies together",
-        "occasions at which it did not answer, and others of its bus that were asked in the same cycle did",
-        "five, and ten times as many as another servo has in the median",
-        "Check its plugs and its cable; exchange the servo where a new cable does not help.",
+        "losses of its replies in cycles with answers of other servos of its bus",
+        "five, and ten times the median of the other servos",
+        "Check its plugs and its cable; exchange the servo if a new cable does not help.",
         _REPLIES,
     ),
     "broken_replies": Rule(
         "servo",
-        "bytes that belong to no packet where its reply is due",
-        "five, and 70 % of those of its bus",
-        "Unplug it and run `dxlrun scan {port}`: if ID {servo_id} still answers, two servos have it; else "
-        "check its plugs.",
+        "stray bytes, outside of any packet, in place of its reply",
+        "five, and 70 % of the broken replies of its bus",
+        "Unplug it and run `dxlrun scan {port}`: if ID {servo_id} still answers, another servo has this ID; "
+        "else check its plugs.",
         Needs.LOG,
     ),
     "servo_error": Rule(
         "servo",
-        "the error bits of its replies, its hardware error, and a temperature that is near its limit or that "
-        "it cannot have",
+        "the error bits of its replies, its hardware error, and a temperature near its limit or impossible",
         "one reply; 10 deg C below Temperature Limit; 120 deg C",
     ),
     "supply": Rule(
-        "bus, or the servo that alone has less voltage",
-        "the lowest voltage of the run, and when",
+        "bus, or a single servo with less voltage",
+        "the lowest voltage of the run, and its time",
         "an input voltage error, or 3 % below the highest while the load is high",
         "Check battery, supply, plugs and the length of the cables.",
         Needs.LOG,
@@ -147,30 +145,30 @@ RULES: Mapping[str, Rule] = {
     "stood_still": Rule(
         "joint",
         "its position while its trajectory moves",
-        "two ticks in 0.5 s while it is to move by 9 deg, and it is as far behind",
+        "at most two ticks in 0.5 s while its trajectory moves by 9 deg, with an error as large",
         "Turn it by hand without torque; compare torque, mode and limits with the robot file "
         "(`dxlrun servo {port} {servo_id} get`).",
         _JOINT,
     ),
     "position_jumped": Rule(
         "joint",
-        "two positions in half a second",
-        "9 deg and a quarter further apart than its model turns in that time",
+        "two positions within half a second",
+        "9 deg apart, and a quarter more than its model can turn in that time",
         "Turn it by hand without torque and watch its position.",
         Needs.INTACT | Needs.LOG,
     ),
     "oscillates": Rule(
-        "joint, or the controller whose goals swing",
-        "swings around its trajectory that this does not have itself",
-        "2 deg, six times a second for a second; 0.6 deg where ten of them follow evenly",
+        "joint, or the controller if its goals swing",
+        "swings around its trajectory, less the swings of the trajectory",
+        "2 deg, six times a second for a second; or ten even swings of 0.6 deg in a row",
         "Lower the gains of servo and controller; look for play in gears and horn.",
         _JOINT,
     ),
     "follows_worse": Rule(
         "joint",
-        "error, lag and load compared with earlier, at the same places and in the same direction",
-        "9 deg from its goal for a second; three times the error of before, and 4.6 deg; 2 deg more, or an "
-        "eighth of its torque, and three times what any other joint shows",
+        "error, lag and load compared with earlier values, at the same places and in the same direction",
+        "an error of 9 deg for a second; three times its earlier error, and 4.6 deg; or a change by 2 deg or "
+        "an eighth of its torque, three times that of any other joint",
         "Turn it by hand without torque, and compare gains and limits with the robot file "
         "(`dxlrun servo {port} {servo_id} get`).",
         _JOINT,
@@ -178,44 +176,46 @@ RULES: Mapping[str, Rule] = {
     # Loop
     "busy_machine": Rule(
         "machine",
-        "seconds in which no core was idle, the host kept one back, or the loop waited for one; a sampler "
-        "that was silent",
+        "seconds without an idle core, with a core withheld by the host, or with the loop waiting for a "
+        "core; a silent sampler",
         "three seconds and a tenth of the run",
     ),
     "own_work": Rule(
-        "loop, or the controller or bus that took the time",
-        "what long cycles took beyond their planned exchanges",
+        "loop, or the slow controller or bus",
+        "time of long cycles beyond their planned exchanges",
         "half of that time, in three cycles; a single stall of a machine is not enough",
-        "Make it faster, give it a lower rate (`{{rate: ...}}`), or lower the loop's.",
+        "Make it faster, give it a lower rate (`{{rate: ...}}`), or lower the rate of the loop.",
         Needs.MACHINE,
     ),
     "skipped": Rule("loop", "skipped periods", "more than `tolerated_skips` of the periods of two seconds"),
     # Sensors and devices
     "silent": Rule(
         "device or sensor",
-        "the loop lost it",
+        "lost by the loop",
         "once",
-        "Check its cable, plugs and supply; until it is back, its states keep their last values.",
+        "Check its cable, plugs and supply; until it returns, its states keep their last values.",
     ),
     "frozen": Rule(
         "device or sensor",
-        "values that are the same to the bit, and trembled before",
-        "a second, and ten times as long as ever before",
-        "Its values are old: look at what it measures with, and switch it off and on.",
+        "identical values after trembling ones",
+        "a second, and ten times the longest time before",
+        "Its values are old: check its sensor, and switch it off and on.",
         Needs.LOG,
     ),
     # The run: these accuse no part
     "run_failed": Rule("", "a process of the run failed, or the loop never ran a cycle", "once"),
-    "fell": Rule("", "the direction of gravity in the frame of the IMU", "60 deg from that at the start"),
+    "fell": Rule(
+        "", "the direction of gravity in the frame of the IMU", "60 deg from its direction at the start"
+    ),
     "goal_missed": Rule(
         "", "a goal of a played motion", "missed, aborted, or not reached before the run ended"
     ),
-    "errors_logged": Rule("", "errors that no other rule is about", "one"),
-    "log_not_whole": Rule("", "records that are missing or cannot be read", "one"),
-    "invalid_states": Rule("", "states of a joint that were not valid", "1 % of the cycles, and three"),
-    "kept_rate": Rule("", "skipped periods, and how late the loop woke", "always told"),
+    "errors_logged": Rule("", "errors without another rule", "one"),
+    "log_not_whole": Rule("", "missing or unreadable records", "one"),
+    "invalid_states": Rule("", "invalid states of a joint", "1 % of the cycles, and three"),
+    "kept_rate": Rule("", "skipped periods, and the wake-up latency of the loop", "always reported"),
     "steered": Rule("", "requests of clients", "one"),
-    "replies": Rule("", "servos that answered, and the worst three of those that did not", "always told"),
+    "replies": Rule("", "servos without losses, and the three with most missing replies", "always reported"),
 }
 """All rules by the code of their findings: buses first, then servos, supply, joints, the loop, sensors and
 devices, and the run."""

@@ -117,9 +117,9 @@ def _robot(totals: RunTotals) -> Iterable[Finding]:
     """Report a robot that was down at the end of the run, and each missed goal of a played motion."""
     if totals.conduct.lies:
         turned = totals.conduct.turned_rad
-        how = "its fall_reflex had others take over" if turned is None else "gravity is "
-        how += "" if turned is None else f"{math.degrees(turned):.0f} deg from where it was at the start"
-        yield Finding("fell", "", f"The robot fell, and lies: {how}.", rank=Rank.SERVO, share=1.0)
+        how = "its fall_reflex switched controllers" if turned is None else "gravity is "
+        how += "" if turned is None else f"{math.degrees(turned):.0f} deg from its direction at the start"
+        yield Finding("fell", "", f"The robot fell and did not get up: {how}.", rank=Rank.SERVO, share=1.0)
     for goal in totals.unreached_goals:
         subject = (goal.report and goal.report.joint) or goal.controller
         remedy = f"{goal.remedy[:1].upper()}{goal.remedy[1:]}." if goal.remedy else ""
@@ -145,12 +145,12 @@ def _loop(totals: RunTotals) -> Iterable[Finding]:
     wake_ups = ", on virtual time" if totals.virtual else ""
     if totals.latency is not None and not totals.virtual:
         late, worst = totals.latency.share_over_150_us, microseconds(totals.latency.max_us)
-        often = f", {late:.1%} more than 150 us" if late > _ROUGH_SHARE else ""
+        often = f", {late:.1%} later than 150 us" if late > _ROUGH_SHARE else ""
         wake_ups = f", worst wake-up {worst} late{often}"
     elapsed = counted(account.elapsed, "period", "periods")
     if totals.plan.loop.schedule == "sequential":
         took = f"{elapsed} of {account.rates} took {account.seconds:.3f} s"
-        yield Finding("kept_rate", "", f"Cycles followed each other, not the clock: {took}{wake_ups}.")
+        yield Finding("kept_rate", "", f"The loop ran sequentially, not by the clock: {took}{wake_ups}.")
         return
     share = account.skipped / account.elapsed
     tolerated = f"{totals.plan.loop.tolerated_skips * 100:.4g}% tolerated"
@@ -204,17 +204,15 @@ def _steered(acts: Sequence[Act], pauses: Sequence[Pause]) -> Iterable[Finding]:
     refused = sum(bool(act.refusal) for act in asked)
     parts += [f"{refused} refused"] if refused else []
     still = sum(pause.end_s - pause.begin_s for pause in pauses)
-    paused = f"; it was paused for {microseconds(still * 1e6)}" if pauses else ""
+    paused = f"; the loop was paused for {microseconds(still * 1e6)}" if pauses else ""
     ends = "".join(
-        f"; the stream for {stream.controller} ended by its lease at {stream.ended_s:.1f} s"
-        f"{', and its joints were held since' if stream.held else ''}"
+        f"; the lease of the stream for {stream.controller} expired at {stream.ended_s:.1f} s"
+        f"{', and its joints were held' if stream.held else ''}"
         for stream in streams
         if stream.ended_s is not None
     )
     share = 0.5 if any(stream.held for stream in streams) else 0.0
-    yield Finding(
-        "steered", "", f"It was steered from outside: {', '.join(parts)}{paused}{ends}.", share=share
-    )
+    yield Finding("steered", "", f"Requests of clients: {', '.join(parts)}{paused}{ends}.", share=share)
 
 
 _OTHER_RULES = frozenset((*HURTS, EventCode.DEVICE_LOST, EventCode.PORT_LOST, EventCode.RECORDER_GAP))
@@ -248,5 +246,5 @@ def _log(totals: RunTotals) -> Iterable[Finding]:
         missing = counted(totals.periods.missing, "period is", "periods are")
         faults.append(f"{missing} neither recorded nor declared skipped")
     if faults:
-        sentence = f"The log is not whole: {'; '.join(faults)}."
+        sentence = f"The log is incomplete: {'; '.join(faults)}."
         yield Finding("log_not_whole", "log", sentence, rank=Rank.LOG)

@@ -208,7 +208,7 @@ def test_a_cycle_longer_than_its_period_is_reported_with_its_longest_step(write:
 
 def test_rough_wake_ups_are_reported(write: Make) -> None:
     report = analyze_log(write([Cycle(number, late=200 if number < 3 else 10) for number in range(100)]))
-    assert "worst wake-up 200 us late, 3.0% more than 150 us." in report.verdict.sentences[1]
+    assert "worst wake-up 200 us late, 3.0% later than 150 us." in report.verdict.sentences[1]
 
 
 def test_errors_gaps_and_a_log_without_end_are_reported(write: Make) -> None:

@@ -193,8 +193,8 @@ def test_controller_with_the_name_of_a_simulated_bus_keeps_its_remedy() -> None:
 @pytest.mark.parametrize(
     ("real_time", "helps"),
     [
-        (RealTime(), "`loop: {scheduler: {policy: round_robin}}` in the robot file helps."),
-        (RealTime(requested=True), "The real-time scheduler that the robot file asks for was not granted"),
+        (RealTime(), "Write `loop: {scheduler: {policy: round_robin}}` into the robot file."),
+        (RealTime(requested=True), "The requested real-time scheduler was not granted"),
         (RealTime(requested=True, granted=True), "End other programs."),
     ],
 )

@@ -114,7 +114,7 @@ def test_only_of_a_shared_packet_the_end_may_be_cut(read: bytes, shared: bool) -
         )
     (finding,) = broken.findings(0, BUS, dict.fromkeys((3, 7, 4), ServoLosses(5, 5, 5)))
     assert "servo 4" in finding.sentence
-    assert ("which all share" in finding.sentence or "that all share" in finding.sentence) == shared
+    assert ("of the shared status packet" in finding.sentence) == shared
 
 
 WRITE_7 = bytes((0xFF, 0xFF, 0xFD, 0, 7, 6, 0, 3, 64, 0, 1, 0, 0))
@@ -143,8 +143,8 @@ def test_a_reply_that_nothing_asked_for(wires: Wires, unasked: list[int]) -> Non
     ("count", "ids", "told"),
     [
         (9, (4,), ""),
-        (10, (4,), "10 replies came that this run did not ask for (of ID 4)."),
-        (12, (4, 9), "12 replies came that this run did not ask for (of IDs 4, 9)."),
+        (10, (4,), "10 unrequested replies (of ID 4)."),
+        (12, (4, 9), "12 unrequested replies (of IDs 4, 9)."),
     ],
 )
 def test_a_host_that_uses_the_same_adapter_is_told_by_the_replies_to_it(

@@ -41,12 +41,15 @@ LOOSE = Joint(position=slack(behind(SWING), 0.05), load=PEER.load)
 LOOSER = Joint(position=slack(behind(SWING), 0.07), load=PEER.load)
 
 CHANGED = {
-    "play": (LOOSE, "upwards it is off by -2.8 deg instead of -0.1"),
-    "each way by itself": (LOOSE, "downwards it is off by 2.9 deg instead of 0.1, with 1% of its torque"),
-    "load not read": (Joint(position=LOOSE.position, load=math.nan), "-2.8 deg instead of -0.1; downwards"),
+    "play": (LOOSE, "upwards -2.8 deg off instead of -0.1"),
+    "each way by itself": (LOOSE, "downwards 2.9 deg off instead of 0.1, with 1% of its torque"),
+    "load not read": (
+        Joint(position=LOOSE.position, load=math.nan),
+        "-2.8 deg off instead of -0.1; downwards",
+    ),
     "friction": (
         Joint(position=LOOSE.position, load=RUBS),
-        "at rest it is off by -2.8 deg instead of 0.0, with 40%",
+        "at rest -2.8 deg off instead of 0.0, with 40%",
     ),
     "later": (Joint(position=np.where(FAULT, behind(SWING, 5), behind(SWING)), load=PEER.load), "-8.3 deg"),
     "pulled": (
@@ -86,9 +89,9 @@ def test_joint_that_follows_otherwise_at_the_same_places_is_named_with_its_numbe
     joint, words = CHANGED[case]
     (one,) = found(joint)
     assert (one.code, one.subject, one.rank) == ("follows_worse", "j0", Rank.CAUSE)
-    assert "follows otherwise than before at the same places" in one.sentence
+    assert "follows differently than before at the same places" in one.sentence
     assert words in one.sentence
-    assert "from 5." in one.sentence
+    assert "starting at 5." in one.sentence
 
 
 @pytest.mark.parametrize("case", LOADED)

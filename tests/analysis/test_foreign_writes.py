@@ -50,7 +50,7 @@ def write(protocol: float, servo_id: int, name: str, value: int, more: bytes = b
 def test_what_was_written_to_which_servo_and_what_failed_then(protocol: float) -> None:
     sent = write(protocol, 4, "torque_enable", 0), write(protocol, 4, "baud_rate", 3)
     assert told(protocol, *sent, failures=(("knee", EventCode.SERVO_LOST, 1.2),)) == (
-        "torque_enable = 0 and baud_rate = 3 to knee (ID 4), which was lost then",
+        "torque_enable = 0 and baud_rate = 3 to knee (ID 4) before it was lost",
         True,
     )
 
@@ -72,7 +72,7 @@ def test_a_servo_that_failed_before_or_much_later_did_not_by_it(
     text, failed = told(1.0, write(1.0, 4, "id", 9), failures=((name, code, at_s),))
     assert failed is by_it
     assert text.startswith("id = 9 to knee (ID 4)" if by_it else "id = 9 to ID 4")
-    assert (" then" in text) is by_it
+    assert (" before it " in text) is by_it
 
 
 @pytest.mark.parametrize("protocol", [1.0, 2.0])

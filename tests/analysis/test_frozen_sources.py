@@ -54,7 +54,7 @@ def findings(
 def test_a_sensor_whose_values_stay_while_joints_move_hangs() -> None:
     (finding,) = findings(HANGS)
     assert (finding.code, finding.subject, finding.rank) == ("frozen", "gyro", Rank.SERVO_CAUSE)
-    assert "for 4.0 s while joints moved, from 2.0 s" in finding.sentence
+    assert "for 4.0 s while joints moved, starting at 2.0 s" in finding.sentence
 
 
 @pytest.mark.parametrize(
@@ -101,16 +101,14 @@ def test_a_device_whose_trembling_values_stand_still_hangs(
 ) -> None:
     (finding,) = findings(still(from_s, 0, 1, 2), joint, kind="device")
     assert (finding.code, finding.subject, finding.rank) == ("frozen", "gyro", Rank.SERVO_CAUSE)
-    assert (
-        "Device gyro (ID 101 on bus main) is frozen: x, y, z stayed the same to the bit" in finding.sentence
-    )
-    assert f"for {seconds:.1f} s, from {from_s:.1f} s" in finding.sentence
+    assert "Device gyro (ID 101 on bus main) is frozen: x, y, z stayed identical" in finding.sentence
+    assert f"for {seconds:.1f} s, starting at {from_s:.1f} s" in finding.sentence
 
 
 def test_one_value_that_stands_still_beside_others_is_named_alone() -> None:
     (finding,) = findings(still(3.0, 1), RESTS, kind="device")
     assert (finding.code, finding.rank) == ("frozen", Rank.CAUSE)
-    assert "is frozen: y stayed the same to the bit for 3.0 s" in finding.sentence
+    assert "is frozen: y stayed identical for 3.0 s" in finding.sentence
     assert "its other values changed" in finding.sentence
 
 

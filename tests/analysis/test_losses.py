@@ -208,7 +208,7 @@ def test_a_plug_that_is_loose_at_some_angles_is_told_with_them(tmp_path: Path) -
     traffic.summarize_traffic()
     (finding,) = traffic.findings
     assert (finding.code, finding.subject) == ("lossy_servo", "left_knee")
-    told = r"(\d+) episodes, (\d+) of them between 1\d and 2\d deg, where it was for 1?\d% of the time"
+    told = r"(\d+) episodes, (\d+) of them between 1\d and 2\d deg \(1?\d% of the time\)"
     assert re.search(told, finding.sentence), finding.sentence
 
 

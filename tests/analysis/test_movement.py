@@ -39,14 +39,14 @@ def since_fault(position: Floats) -> Floats:
 
 UNFAITHFUL = {
     "frozen": (Joint(position=FROZEN), "stood still, to the tick, at -45.6 deg for 6.0 s"),
-    "with its load": (Joint(position=FROZEN), "with 20% of its torque, 21% otherwise; from 5.1 s"),
+    "with its load": (Joint(position=FROZEN), "with 20% of its torque, 21% otherwise; starting at 5.1 s"),
     "jammed": (
         Joint(position=FROZEN, load=np.where(FAULT, 0.9, 0.2)),
         "with 90% of its torque, 20% otherwise",
     ),
     "never moved": (Joint(position=np.zeros(600)), "stood still, to the tick, at 0.0 deg for 12.0 s"),
-    "load not read": (Joint(position=np.zeros(600), load=math.nan), "its load is not read"),
-    "since its goal left it": (Joint(LATE, np.zeros(600), 0.9), "from 5.0 s of the run on"),
+    "load not read": (Joint(position=np.zeros(600), load=math.nan), "its load was not read"),
+    "since its goal left it": (Joint(LATE, np.zeros(600), 0.9), "starting at 5.0 s of the run"),
     "trembles by a tick": (
         Joint(position=FROZEN + np.where(FAULT, TICK * (np.arange(600) % 2), 0.0)),
         "stood still at -45.6 deg",
@@ -55,16 +55,25 @@ UNFAITHFUL = {
         Joint(position=ONE_SIDE, load=0.2),
         "stops at 11.5 deg each time, and stood still there",
     ),
-    "at one speed": (Joint(position=AT_ONE_SPEED, load=0.2), "38% of its way, at up to 22.9 deg/s, with 20%"),
+    "at one speed": (
+        Joint(position=AT_ONE_SPEED, load=0.2),
+        "38% of the commanded distance, at up to 22.9 deg/s, with 20%",
+    ),
     "at half its way": (Joint(position=behind(SWING, 6, 0.5)), "was 23.3 deg from its goal for 3.9 s, and"),
     "off at rest": (Joint(np.full(600, -0.2), np.full(600, -0.6)), "was 22.9 deg from its goal for 12.0 s"),
     "weak": (Joint(position=WEAK, load=np.where(FAULT, 0.05, 0.2)), "with 5% of its torque, 20% otherwise"),
-    "gain lost": (Joint(position=since_fault(behind(SWING, gain=0.4))), "17.5 deg away instead of 1.7 deg"),
-    "zero moved": (Joint(position=since_fault(behind(SWING) + 0.25)), "14.3 deg away instead of 1.7 deg"),
-    "late": (Joint(position=since_fault(behind(SWING, 8))), "9.3 deg away instead of 1.7 deg"),
+    "gain lost": (
+        Joint(position=since_fault(behind(SWING, gain=0.4))),
+        "an error of 17.5 deg instead of 1.7 deg",
+    ),
+    "zero moved": (
+        Joint(position=since_fault(behind(SWING) + 0.25)),
+        "an error of 14.3 deg instead of 1.7 deg",
+    ),
+    "late": (Joint(position=since_fault(behind(SWING, 8))), "an error of 9.3 deg instead of 1.7 deg"),
     "far off": (
         Joint(position=since_fault(behind(SWING) + 0.5), load=0.2),
-        "28.6 deg away instead of 1.7 deg",
+        "an error of 28.6 deg instead of 1.7 deg",
     ),
 }
 """Joints that do not do what they are told for a second or more, and words of what is said of them."""
@@ -89,7 +98,7 @@ def test_joints_that_get_worse_together_are_not_accused() -> None:
     worse = Joint(position=since_fault(behind(SWING, gain=0.5)))
     (finding,) = findings(worse, worse, worse)
     assert (finding.code, finding.subject) == ("follows_worse", "main")
-    assert "it is what they share" in finding.sentence
+    assert "the cause is common" in finding.sentence
 
 
 @pytest.mark.parametrize(
@@ -111,7 +120,7 @@ def test_goals_that_swing_faster_than_the_joint_accuse_its_commands(away: float,
     goals = np.where(FAULT, 0.15 * np.sign(np.cos(2 * math.pi * 8.0 * TIME + 0.1)), 0.0)
     found = findings(Joint(way=goals, position=(1 - away / 0.15) * goals), Joint(), Joint())
     assert [(one.code, one.subject, one.rank) for one in found] == [("oscillates", "j0", Rank.CAUSE)] * told
-    assert all("j0 oscillates 8 times a second, as its commands do" in one.sentence for one in found)
+    assert all("j0 oscillates 8 times a second, like its commands" in one.sentence for one in found)
     assert all("/commands" in one.remedy for one in found)
 
 
@@ -123,9 +132,7 @@ def test_a_joint_that_a_controller_moves_with_an_effort_shakes_around_its_refere
     joint = Joint(np.full(600, np.nan), SWING + shaking, effort=SWING, sought=SWING)
     found = findings(joint, Joint(), Joint())
     assert [(one.code, one.subject) for one in found] == [("oscillates", "j0")] * shakes
-    assert all(
-        "around its goal, to which a controller moves it with an effort" in one.sentence for one in found
-    )
+    assert all("around its goal under effort control" in one.sentence for one in found)
     swung = Joint(np.full(600, np.nan), SWING + shaking, effort=SWING, sought=SWING + shaking)
     assert findings(swung, Joint(), Joint()) == []
     by_hand = Joint(np.full(600, np.nan), SWING + shaking, torque=Torque.RELEASED, sought=SWING)
@@ -206,8 +213,8 @@ SHIFTED = behind(SWING) + 0.4 * np.exp(-np.maximum(TIME - 5.0, 0.0) / 0.1) * FAU
 def test_a_position_that_changes_faster_than_the_model_turns_jumped(sign: int) -> None:
     finding = only(Joint(position=behind(SWING) + sign * (SHIFTED - behind(SWING)), planned=QUICK))
     assert (finding.code, finding.rank) == ("position_jumped", Rank.CAUSE)
-    assert "jumped, by up to 2" in finding.sentence
-    assert "from 5.0 s" in finding.sentence
+    assert "a position jump of up to 2" in finding.sentence
+    assert "starting at 5.0 s" in finding.sentence
 
 
 @pytest.mark.parametrize(

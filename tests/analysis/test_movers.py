@@ -43,7 +43,7 @@ def test_a_gear_and_a_slide_share_their_ratio(write: Callable[..., Path]) -> Non
     ]
     assert {one.unit for one in tracking(read_log(path))} == {LINEAR}
     table = tables(analyze(read_log(path)))["joints"]
-    assert "of linear joints in mm" in table.title
+    assert "linear joints in mm" in table.title
 
 
 def test_a_differentials_joints_have_both_servos_and_a_pair_shares_its_joint() -> None:

@@ -131,7 +131,9 @@ def test_played_goal_that_the_end_of_the_run_cut_is_not_good() -> None:
     cut = GoalReport(1, "arm", "trajectory", f"{WAVE}:4:5", "aborted", RUN_ENDED)
     verdict = judge_run(totals(conduct=conduct(goals=goals(1, cut))))
     assert not verdict.good
-    assert verdict.sentences[0].startswith("Not good: the run ended before wave of arm did; played wave ")
+    assert verdict.sentences[0].startswith(
+        "Not good: the run ended before the end of wave of arm; played wave "
+    )
     assert verdict.sentences[1] == "The run ended at 20 s, before wave of arm ended at 25 s."
     a_client_s = structs.replace(cut, origin="anna")
     assert line(conduct=conduct(goals=goals(1, a_client_s))).startswith("Good: the run ended before ")
@@ -162,7 +164,7 @@ def test_joints_that_a_client_released_are_said() -> None:
 
 def test_of_a_log_that_was_cut_it_is_not_known_how_long_the_run_was() -> None:
     cut = line(plan=LoggedPlan(), conduct=Conduct(), damage=("it ends in a chunk",))
-    assert cut == "Not good: the log is not whole; the log has 20.0 s without a motion."
+    assert cut == "Not good: the log is incomplete; the log has 20.0 s without a motion."
 
 
 def test_a_run_that_is_not_good_for_another_reason_says_it() -> None:
@@ -175,7 +177,7 @@ def test_a_run_that_is_not_good_for_another_reason_says_it() -> None:
     [
         (Finding("stood_still", "elbow", "It.", rank=Rank.SERVO), "elbow: stood still"),
         (Finding("supply", "elbow", "It.", rank=Rank.SHARE_CAUSE), ""),
-        (Finding("log_not_whole", "log", "It.", rank=Rank.LOG), "the log is not whole"),
+        (Finding("log_not_whole", "log", "It.", rank=Rank.LOG), "the log is incomplete"),
     ],
 )
 def test_the_first_fact_is_the_reason(finding: Finding, reason: str) -> None:
@@ -191,7 +193,7 @@ def test_an_error_that_was_logged_is_the_reason_in_its_own_words() -> None:
 def test_goals_that_a_client_cancelled_are_said() -> None:
     gone = conduct(goals=GoalTotals({"accepted": 1, "cancelled": 1}))
     assert line(conduct=gone, plan=LoggedPlan()).endswith(
-        "moved by commands from outside within 2.1 deg (elbow); 1 goal cancelled."
+        "moved by clients within 2.1 deg (elbow); 1 goal cancelled."
     )
 
 
@@ -223,7 +225,9 @@ def test_a_robot_that_its_fall_reflex_could_not_keep_up_fell(tmp_path: Path) -> 
     simulated_robot(ROBOTS / "fall_reflex.yaml", play=[motion], log=log).run()
     verdict = judge_run(totals_of(log))
     assert not verdict.good
-    assert verdict.sentences[0].startswith("Not good: it fell at 1.6 s and lies; played fall_reflex_tip ")
+    assert verdict.sentences[0].startswith(
+        "Not good: the robot fell at 1.6 s and did not get up; played fall_reflex_tip "
+    )
     assert verdict.findings[1].code == "fell"
 
 

@@ -86,11 +86,11 @@ def test_the_periods_are_those_of_each_cycle(log: Log, report: Report) -> None:
 
 def test_the_verdict_has_it(report: Report) -> None:
     robot, loop, steered, *_ = report.verdict.sentences
-    assert robot.startswith("Good: moved by commands from outside within ")
+    assert robot.startswith("Good: moved by clients within ")
     assert loop == "The loop kept 50 Hz and 100 Hz: 0 of 56 periods skipped, on virtual time."
     assert steered == (
-        "It was steered from outside: 2 rate requests, 1 pause request, 1 switch request, 1 command, "
-        "1 stop request, 1 stream of 8 set-points, 3 refused; it was paused for 200.00 ms."
+        "Requests of clients: 2 rate requests, 1 pause request, 1 switch request, 1 command, "
+        "1 stop request, 1 stream of 8 set-points, 3 refused; the loop was paused for 200.00 ms."
     )
 
 
@@ -140,11 +140,11 @@ def test_a_pause_is_counted_in_periods_and_in_seconds(report: Report) -> None:
 @pytest.mark.parametrize(
     ("later", "ends"),
     [
-        ({}, "; the stream for head ended by its lease at 0.4 s, and its joints were held since"),
+        ({}, "; the lease of the stream for head expired at 0.4 s, and its joints were held"),
         ({25: [send(0.2, 0.2)]}, ""),
         (
             {25: [ask("switch", activate=["tail"], deactivate=["head"])]},
-            "; the stream for head ended by its lease at 0.4 s",
+            "; the lease of the stream for head expired at 0.4 s",
         ),
         ({cycle: [send(0.1, 0.1, lease_ns=50 * MS)] for cycle in range(18, 100)}, ""),
     ],
@@ -157,8 +157,8 @@ def test_a_stream_that_ended_by_its_lease_is_told(tmp_path: Path, later: Asked, 
     assert steered.remedy == ""
     sentence = steered.sentence.removesuffix(".")
     assert sentence.endswith(ends)
-    assert bool(ends) == ("ended by its lease" in sentence)
-    assert (report.verdict.findings[1] == steered) is ends.endswith("since")
+    assert bool(ends) == (" expired at " in sentence)
+    assert (report.verdict.findings[1] == steered) is ends.endswith("its joints were held")
 
 
 def test_a_cycle_is_measured_by_its_own_period(tmp_path: Path) -> None:
@@ -185,7 +185,7 @@ def test_the_page_shows_it(log: Log, report: Report) -> None:
     _, text = analyzed_page(log)
     assert 'id="steering"' in text
     assert "switch activate tail; deactivate head" in text
-    assert "Shaded: the loop was paused. Dotted lines: it was steered otherwise." in text
+    assert "Shaded: the loop was paused. Dotted lines: controllers, rate or policy were changed." in text
     assert text.count('"BoxAnnotation"') >= 4  # and those that tools draw with
 
 

@@ -84,29 +84,34 @@ SUPPLIES: dict[str, tuple[Floats, int | list[int], str, str]] = {
         volts(None, 1.2 * LOADS.sum(axis=1)),
         0,
         "main",
-        "falls while the load is high",
+        "it falls under load",
     ),
-    "runs down": (volts(None, RUNS_DOWN), 0, "main", "was 9.1 V at 19.6 s of the run, its lowest"),
-    "and says so": (volts(None, RUNS_DOWN), 0, "main", "it fell in the course of the run"),
+    "runs down": (volts(None, RUNS_DOWN), 0, "main", "was 9.1 V at its lowest (19.6 s of the run)"),
+    "and says so": (volts(None, RUNS_DOWN), 0, "main", "it fell during the run"),
     "creeps up": (volts(None, RISES), [1, 1, 1, 1], "main", "and 17.0 V at most; an input voltage error was"),
     "too high": (volts(None, -5.0), [1, 1, 1, 1], "main", "17.0 V at most"),
-    "too low": (volts(None, 4.0), [1, 1, 1, 0], "main", "was 8.0 V at 0.0 s of the run, its lowest"),
+    "too low": (volts(None, 4.0), [1, 1, 1, 0], "main", "was 8.0 V at its lowest (0.0 s of the run)"),
     "with its limits": (volts(None, 4.0), [1, 1, 1, 0], "main", "9.5 to 16.0 V are allowed."),
-    "one sags": (volts(2, 2.5 * LOADS[:, 2]), 0, "j2", "was 10.0 V at 6.4 s of the run, its lowest"),
+    "one sags": (volts(2, 2.5 * LOADS[:, 2]), 0, "j2", "was 10.0 V at its lowest (6.4 s of the run)"),
     "one is low": (
         volts(2, np.where(TIME > 3.0, 2.0, 0.0)),
         0,
         "j2",
-        "while the others of bus main had 12.0 V",
+        "while the other servos of bus main had 12.0 V",
     ),
     "one was low once": (
         volts(2, np.where((TIME > 9) & (TIME < 14), 1.5, 0.0)),
         0,
         "j2",
-        "was 10.5 V at 9.4 s",
+        "was 10.5 V at its lowest (9.4 s",
     ),
-    "one reports a dip": (volts(1, DIP), 1, "j1", "was 7.0 V at 7.2 s"),
-    "one sags and reports": (volts(1, 5 * LOADS[:, 1]), 1, "j1", "while the others of bus main had 12.0 V"),
+    "one reports a dip": (volts(1, DIP), 1, "j1", "was 7.0 V at its lowest (7.2 s"),
+    "one sags and reports": (
+        volts(1, 5 * LOADS[:, 1]),
+        1,
+        "j1",
+        "while the other servos of bus main had 12.0 V",
+    ),
     "one reports and reads well": (volts(), 1, "j1", "12.0 V at most; an input voltage error was reported"),
 }
 """Voltages, hardware errors, what is accused, and words of what is said of it."""
@@ -144,7 +149,10 @@ def test_voltages_that_differ_accuse_nothing(innocent: Floats) -> None:
 
 @pytest.mark.parametrize(
     ("heat", "words"),
-    [(200.0, "cannot have, from 30 to 200 deg C"), (75.0, "was hot, at 75 deg C of 80 deg C")],
+    [
+        (200.0, "impossible temperatures, from 30 to 200 deg C"),
+        (75.0, "was hot, at 75 deg C with a limit of 80 deg C"),
+    ],
 )
 def test_temperature_near_its_limit_or_beyond_sense_is_told(heat: float, words: str) -> None:
     ((code, subject, sentence),) = findings(volts(), heat=heat)

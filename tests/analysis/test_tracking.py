@@ -214,5 +214,5 @@ def test_terminal_report_and_json_have_the_same_numbers(make: Make) -> None:
     (as_json,) = json.loads(json_text(report.numbers))["joints"]
     assert as_json["lag_ms"] == pytest.approx(60.0, rel=0.02)
     assert as_json["worst_rad"] == pytest.approx(0.03)
-    words = "worst 1.72 deg (position minus what was reachable), lag 59 ms, settled after"
+    words = "worst 1.72 deg (position minus reachable trajectory), lag 59 ms, settled after"
     assert words in analyzed_page(log)[1]

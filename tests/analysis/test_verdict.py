@@ -141,7 +141,7 @@ def test_a_joint_may_be_unknown_in_one_cycle_of_a_hundred(invalid: int, good: bo
     assert verdict.good is good
     if not good:
         assert verdict.sentences[1] == (
-            f"States were invalid: wrist in {invalid / 10:.1f}% of the cycles; 1% tolerated."
+            f"States were invalid: wrist in {invalid / 10:.1f}% of the cycles; 1% is tolerated."
         )
 
 
@@ -162,7 +162,7 @@ def test_invalid_states_are_those_of_the_first_servo_without_a_reply(
     (found,) = (one for one in findings if one.code == "invalid_states")
     assert found.subject == subject
     assert found.sentence.startswith("States were invalid: elbow in 5.0%, wrist in 5.0% of the cycles, ")
-    assert f"{waiting} of them because replies before theirs were missing" in found.sentence
+    assert f"{waiting} of these joints because a preceding reply was missing" in found.sentence
 
 
 @pytest.mark.parametrize("spoilt", ["", "noise", "another_host"])
@@ -252,7 +252,7 @@ def test_a_servo_that_answers_again_and_is_not_taken_back_is_told_with_why() -> 
     (servo,) = (one for one in verdict.findings if one.code == "servo_lost")
     told = f"Servos failed: elbow was lost; wrist was lost. elbow {why}."
     assert (servo.subject, servo.sentence) == ("elbow", told)
-    assert "as in the robot file" in servo.remedy
+    assert "the values of the robot file" in servo.remedy
 
 
 @pytest.mark.parametrize("port", ["/dev/ttyUSB0", "sim"])
@@ -484,7 +484,7 @@ def test_damage_is_reported_of_a_scanned_log_too(storm: Path, tmp_path: Path) ->
     data = storm.read_bytes()
     cut.write_bytes(data[: len(data) * 2 // 3])
     assert judge_run(totals_of(cut)) == analyze_log(cut).verdict
-    assert any("log is not whole" in sentence for sentence in judge_run(totals_of(cut)).sentences)
+    assert any("log is incomplete" in sentence for sentence in judge_run(totals_of(cut)).sentences)
 
 
 @pytest.mark.parametrize("virtual", [False, True])

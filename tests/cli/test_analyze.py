@@ -102,8 +102,8 @@ def test_without_an_argument_a_log_that_is_being_written_is_not_analyzed(dxlrun:
         said = dxlrun("analyze")
     assert said.code == 2
     assert said.errors == [
-        f"dxlrun: {newest.relative_to(Path.cwd())} is being written; end the run, or give this path to "
-        "analyze it so far"
+        f"dxlrun: {newest.relative_to(Path.cwd())} is being written; end its run, or give this path "
+        "for a partial analysis"
     ]
 
 
@@ -129,8 +129,8 @@ def test_without_a_log_in_the_directory_one_sentence_names_the_directory(
 
     assert said.code == 2
     assert said.errors == [
-        f"dxlrun: there is no log in {tmp_path}/logs; give the path of a log, or change to the directory "
-        "where the robot was run"
+        f"dxlrun: no log found in {tmp_path}/logs; give the path of a log, or change to the working "
+        "directory of the run"
     ]
 
 
@@ -158,19 +158,19 @@ def test_what_is_for_one_log_is_refused_for_several(dxlrun: Callable, log: Path,
     said = dxlrun("analyze", first, second, option, value)
 
     assert said.code == 2
-    assert said.errors == [f"dxlrun: {option} is for one log, and 2 are given; give it once for each"]
+    assert said.errors == [f"dxlrun: {option} is for one log, but 2 are given; analyze one at a time"]
 
 
 def test_every_log_that_is_missing_is_named(dxlrun: Callable, log: Path):
     said = dxlrun("analyze", "a.mcap", log, "b.mcap")
 
     assert said.code == 2
-    assert [line[:26] for line in said.errors] == ["dxlrun: there is no log a.", "dxlrun: there is no log b."]
+    assert [line[:20] for line in said.errors] == ["dxlrun: log a.mcap n", "dxlrun: log b.mcap n"]
 
 
 @pytest.mark.parametrize("worst", ["-1", "11"])
 def test_more_worst_cycles_than_are_kept_are_refused(dxlrun: Callable, log: Path, worst: str):
     said = dxlrun("analyze", log, f"--worst={worst}")
     assert said.code == 2
-    assert f"--worst {worst}: so many cycles are not kept; give 1 to 10" in said.err
+    assert f"--worst {worst}: out of range; give 1 to 10" in said.err
     assert "Cycle " not in dxlrun("analyze", log, "--worst", "3").out  # none was late

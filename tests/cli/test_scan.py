@@ -91,4 +91,4 @@ def test_the_packets_of_a_scan_are_a_log_when_it_is_named(dxlrun, simulated_line
     assert "runtime" in read.metadata["identity"]
     said = dxlrun("analyze", log)
     assert (said.code, said.err) == (0, "")
-    assert f"the traffic of `dxlrun scan {path}`, no run: {len(read.packets)} packets" in said.out
+    assert f"traffic of `dxlrun scan {path}`, not a run: {len(read.packets)} packets" in said.out

@@ -165,8 +165,8 @@ def test_the_yardstick_has_the_policy_of_what_it_is_compared_with(compare, polic
         ("other,fifu", None, "--compare: 'fifu' is not a condition; did you mean fifo?"),
         ("other,,c", None, "--compare: '' is not a condition; known: c, fifo, other, round_robin"),
         ("other,c,other", None, "--compare: other is named twice"),
-        ("fifo", None, "--compare fifo: a comparison takes two; use --policy fifo for one"),
-        ("other,fifo", "fifo", "--policy is for c where conditions are compared, and c is not among them"),
+        ("fifo", None, "--compare fifo: a comparison needs two; use --policy fifo for one"),
+        ("other,fifo", "fifo", "with --compare, --policy is only for condition c"),
     ],
 )
 def test_a_comparison_that_makes_no_sense_is_one_sentence(compare, policy, sentence):
@@ -187,9 +187,9 @@ def test_a_comparison_that_makes_no_sense_is_one_sentence(compare, policy, sente
         ({"iterations": 3, "blocks": 4}, "3 iterations cannot be divided into 4 blocks"),
         ({"blocks": 0}, "--blocks 0: give from 1 to 1000"),
         ({"priority": 0}, "--priority 0: real-time priorities are 1 to 99"),
-        ({"cores": (0, 999)}, "--cores: this process may not run on core 999; it may on 0, 1"),
+        ({"cores": (0, 999)}, "--cores: core 999 is not available to this process; choose from 0, 1"),
         ({"polling_ns": 600_000}, "--polling 600 us is more than half of the period"),
-        ({"iterations": 10**6, "period_ns": 10**9}, "this would take 277.8 h, and 24 h are the most"),
+        ({"iterations": 10**6, "period_ns": 10**9}, "the measurement would take 277.8 h, over 24 h"),
     ],
 )
 def test_values_with_which_nothing_can_be_measured_are_one_sentence(change, sentence):
@@ -280,7 +280,7 @@ def test_conditions_are_divided_by_the_yardstick_block_by_block():
     assert result.reference == "c"
     assert ours.ratios["mean_us"] == interval([0.2, 0.05, 0.5])
     assert yardstick.ratios == {}
-    assert result.remarks == ("over 3 blocks the intervals are wide: give --blocks 5 or more to compare",)
+    assert result.remarks == ("3 blocks give wide intervals; give --blocks 5 or more to compare",)
 
 
 def test_what_was_broken_off_is_left_out_or_used_as_far_as_it_goes():
@@ -292,7 +292,7 @@ def test_what_was_broken_off_is_left_out_or_used_as_far_as_it_goes():
     assert figures(found, [block(C, 1, [])]).conditions == ()
     only = figures(found, blocks[:1])
     assert (len(only.conditions), only.reference) == (1, "")
-    assert only.remarks == ("over 1 block there is no interval: give --blocks 5 or more to compare",)
+    assert only.remarks == ("1 block gives no interval; give --blocks 5 or more to compare",)
 
 
 def test_a_block_that_was_broken_off_does_not_weigh_as_much_as_a_whole_one():
@@ -370,7 +370,7 @@ def test_a_log_whose_description_is_damaged_is_one_sentence(log, tmp_path):
     def read(**other):
         return open_log(written_anew(log[0], tmp_path / "other.mcap", lambda read: replace(read, **other)))
 
-    with pytest.raises(LogError, match="the log of a measurement that cannot be read"):
+    with pytest.raises(LogError, match="the details of the measurement cannot be read"):
         latency_log.measurement(read(metadata={"latency": {"about": "{"}}))
     with pytest.raises(LogError, match="the log has no wake-up"):
         latency_log.measurement(read(topics={}))

@@ -119,9 +119,9 @@ def test_pruning_shows_asks_and_deletes_only_after_a_yes(
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["--prune"], "--prune and --keep belong together"),
-        (["--keep", "1GB"], "--prune and --keep belong together"),
-        (["--prune", "--keep", "1GB", "--sort", "log"], "--prune and --keep belong together"),
+        (["--prune"], "write --prune and --keep together"),
+        (["--keep", "1GB"], "write --prune and --keep together"),
+        (["--prune", "--keep", "1GB", "--sort", "log"], "write --prune and --keep together"),
         (["--prune", "--keep", "5"], "--keep 5: '5' has no unit; write a size"),
         (["--prune", "--keep", "5 s"], "which is not one of a size"),
     ],

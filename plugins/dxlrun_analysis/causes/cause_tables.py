@@ -36,8 +36,8 @@ def causes_table(causes: Causes) -> Table:
         for one in causes.causes[:_MOST_CAUSES]
     ]
     late, long = (counted(number, "cycle", "cycles") for number in (causes.late, causes.long))
-    title = f"Causes: {late} woke late, {long} took too long, {microseconds(causes.excess_ns / 1e3)} together"
-    title += f" in the {KEPT} worst" if max(causes.late, causes.long) > KEPT else ""
+    title = f"Causes: {late} woke late, {long} took too long; excess {microseconds(causes.excess_ns / 1e3)}"
+    title += f" in the {KEPT} worst cycles" if max(causes.late, causes.long) > KEPT else ""
     return Table.from_rows(title, columns, rows)
 
 
@@ -81,6 +81,6 @@ def _timeline(one: WorstCycle) -> Table:
 def worst_title(one: WorstCycle) -> str:
     """Return the title of a cycle's table: number, time, excess beyond the plan, main causes."""
     causes = ", ".join(f"{share.label} {microseconds(share.us)}" for share in one.causes[:_MOST_NAMED])
-    skipped = f", {counted(one.skipped, 'period', 'periods')} skipped after it" if one.skipped else ""
+    skipped = f", then {counted(one.skipped, 'period', 'periods')} skipped" if one.skipped else ""
     beyond = f"{microseconds(one.excess_us)} beyond the plan{skipped}"
     return f"Cycle {one.cycle}, {one.seconds:.3f} s, {beyond}: {causes}"

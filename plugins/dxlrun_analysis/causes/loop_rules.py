@@ -18,9 +18,9 @@ _LEAST_CYCLES = 3  # One stall of a machine is not evidence
 _MOST_OF_IT = 0.5  # Share of the excess of all long cycles
 _OWN: dict[CauseKind, str] = {
     "controller": "Controller {} made cycles too long: its update took {}.",
-    "own work": "The loop's own work, or what interrupted it, took {1}.",
-    "write call": "Cycles were too long, as write() calls of {} took {}.",
-    "plan": "The planned exchange alone is longer than the period: by {1}.",
+    "own work": "The loop's own work, or an interruption, took {1}.",
+    "write call": "The write() calls of {} made cycles too long: they took {}.",
+    "plan": "The planned exchange alone exceeds the period by {1}.",
 }
 
 

@@ -25,7 +25,7 @@ def _log(_: object, tokens: Sequence[Token]) -> Path:
     place = tokens[0].value
     if "://" not in place:
         return Path(place)
-    if missing := missing_extra("a log of a store", "store", "fsspec", "pyarrow"):
+    if missing := missing_extra("a log in a store", "store", "fsspec", "pyarrow"):
         raise InputError(missing)
     from dxlrun_analysis.season.store import fetch
 
@@ -82,7 +82,7 @@ def analyze(
         if as_json:
             show_json({"command": command, "packets": packets})
         else:
-            show_parts(f"{log}: the traffic of `{command}`, no run: {counted(packets, 'packet', 'packets')}")
+            show_parts(f"{log}: traffic of `{command}`, not a run: {counted(packets, 'packet', 'packets')}")
         return 0
     with progress_bar(hidden=as_json) as draw:
 
@@ -113,13 +113,13 @@ def _check(logs: Sequence[Path], *, report: Path | None, worst: int) -> None:
         InputError: Some options or logs cannot be used.
     """
     if not 0 <= worst <= MOST_WORST:
-        raise InputError(f"--worst {worst}: so many cycles are not kept; give 1 to {MOST_WORST}")
+        raise InputError(f"--worst {worst}: out of range; give 1 to {MOST_WORST}")
     given = {"--report": report is not None, "--worst": worst > 0}
     if len(logs) > 1 and any(given.values()):
         option = next(name for name, there in given.items() if there)
-        raise InputError(f"{option} is for one log, and {len(logs)} are given; give it once for each")
+        raise InputError(f"{option} is for one log, but {len(logs)} are given; analyze one at a time")
     missing = [
-        f"there is no log {log}; a run prints the path of its log when it ends"
+        f"log {log} not found; a run prints the path of its log when it ends"
         for log in logs
         if not log.exists()
     ]
@@ -165,10 +165,10 @@ def newest_log() -> Path:
     if ended is not None:
         return ended
     if logs:
-        raise InputError(f"{logs[0]} is being written; end the run, or give this path to analyze it so far")
+        raise InputError(f"{logs[0]} is being written; end its run, or give this path for a partial analysis")
     raise InputError(
-        f"there is no log in {directory.absolute()}; give the path of a log, or change to the directory "
-        "where the robot was run"
+        f"no log found in {directory.absolute()}; give the path of a log, or change to the working "
+        "directory of the run"
     )
 
 

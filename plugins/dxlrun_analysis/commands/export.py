@@ -47,9 +47,9 @@ def export(
         Topic for csv: /events, /commands, /bus/NAME or a topic of a controller. Default: /cycle.
     """
     if not log.exists():
-        raise InputError(f"there is no log {log}; a run prints the path of its log when it ends")
+        raise InputError(f"log {log} not found; a run prints the path of its log when it ends")
     if topic is not None and file_format != "csv":
-        raise InputError(f"--topic is for csv, and {file_format} has all topics; omit it")
+        raise InputError(f"--topic is only for csv, {file_format} has all topics; omit --topic")
     if missing := missing_extra(file_format, "logs", "pyarrow"):
         raise InputError(missing)
     from dxlrun import open_log

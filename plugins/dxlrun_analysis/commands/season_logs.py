@@ -70,7 +70,7 @@ def logs(
     """
     if prune or keep is not None:
         if not prune or keep is None or (where, sort) != (None, None):
-            raise InputError("--prune and --keep belong together, without others: --prune --keep 10GB")
+            raise InputError("write --prune and --keep together, without other options: --prune --keep 10GB")
         return _prune(Path(directory), keep, as_json=as_json)
     _check(directory)
     from dxlrun_analysis.season import query, season_runs
@@ -85,8 +85,8 @@ def logs(
             )
     except OSError as error:
         raise InputError(
-            f"the table cannot be kept in {season_runs.cache_directory()} ({error.strerror or error}); "
-            "XDG_CACHE_HOME names another place"
+            f"the table of runs cannot be saved in {season_runs.cache_directory()} "
+            f"({error.strerror or error}); set XDG_CACHE_HOME to another directory"
         ) from error
     rows = query.select_runs(table, where, sort)
     if as_json:
@@ -122,9 +122,7 @@ def upload(directory: Path, store: str, /, *, as_json: JsonFlag = False, debug: 
     folder = season_runs.find_logs(directory)
     with progress_bar(hidden=as_json) as draw:
         result = stores.upload(folder, store, draw)
-    others = [
-        f"{store} has another run named {name}; give each robot a prefix of its own" for name in result.others
-    ]
+    others = [f"{store} has a different run named {name}; use one prefix per robot" for name in result.others]
     written = [f"{name} was skipped: a run is writing it" for name in result.written]
     if as_json:
         show_json(result._asdict(), code=1 if others else 0, errors=others, warnings=written)
@@ -134,7 +132,7 @@ def upload(directory: Path, store: str, /, *, as_json: JsonFlag = False, debug: 
     for name in written:
         print_warning(name)
     uploaded = counted(len(result.uploaded), "log was", "logs were")
-    show_parts(f"{uploaded} copied to {store}; {len(result.there)} of {len(folder.logs)} were there")
+    show_parts(f"{uploaded} copied to {store}; {len(result.there)} of {len(folder.logs)} were there already")
     return 1 if others else 0
 
 
@@ -146,7 +144,9 @@ def _prune(directory: Path, keep: str, *, as_json: bool) -> int:
     from dxlrun.tooling.logs import oldest_beyond, stored_logs
 
     if not directory.is_dir():
-        raise InputError(f"there is no directory {directory}; runs leave their logs in logs")
+        raise InputError(
+            f"directory {directory} not found; give the directory of the logs, by default `logs`"
+        )
     keep_bytes = parse_size("--keep", keep)
     logs, oldest = stored_logs(directory), oldest_beyond(directory, keep_bytes)
     names = [str(one.path) for one in oldest]
@@ -165,7 +165,7 @@ def _prune(directory: Path, keep: str, *, as_json: bool) -> int:
     ]
     show_parts(Table.from_rows("", columns, rows), f"{directory} has {them}, {decimal(whole)}")
     if not sys.stdin.isatty():
-        raise InputError("they are deleted when somebody says yes at a terminal; nothing was deleted")
+        raise InputError("nothing was deleted: stdin is not a terminal; run the command in a terminal")
     question = f"Delete {counted(len(oldest), 'log', 'logs')}, {decimal(freed)}?"
     if not Confirm.ask(question, default=False):
         show_parts("nothing was deleted")
@@ -193,7 +193,7 @@ def _found(place: str) -> Folder | Store:
 
     store = find_store(place)
     if not store.logs:
-        raise InputError(f"{place}: there are no logs in it; `dxlrun upload DIRECTORY {place}` brings some")
+        raise InputError(f"{place}: no logs found; upload logs with `dxlrun upload DIRECTORY {place}`")
     return store
 
 
@@ -210,8 +210,11 @@ def _check(place: str) -> None:
     if "://" in place:
         needed = ("store", "duckdb", "fsspec")
     elif not directory.is_dir():
-        fix = "`dxlrun analyze` takes single logs" if directory.exists() else "runs leave their logs in logs"
-        wrong.append(f"there is no directory {directory}; {fix}")
+        wrong.append(
+            f"{directory} is not a directory; analyze a single log with `dxlrun analyze`"
+            if directory.exists()
+            else f"directory {directory} not found; give the directory of logs, by default `logs`"
+        )
     if missing := missing_extra("logs", *needed):
         wrong.append(missing)
     if wrong:

@@ -198,9 +198,9 @@ class FrozenSources:
         where = "".join(f" (ID {each.servo_id} on bus {bus.name})" for bus, each in found)
         kind = next(source.kind for source in self._plan.loop.sources if source.name == name).capitalize()
         sentence = (
-            f"{kind} {name}{where} is frozen: {values} stayed the same to the bit for "
-            f"{stay.hung_s:.1f} s{then}, from {stay.from_s:.1f} s of the run on; before, for "
-            f"{stay.usual_s * 1e3:.0f} ms at most."
+            f"{kind} {name}{where} is frozen: {values} stayed identical for {stay.hung_s:.1f} s{then}, "
+            f"starting at {stay.from_s:.1f} s of the run; the longest time before was "
+            f"{stay.usual_s * 1e3:.0f} ms."
         )
         return Finding("frozen", name, sentence, rank=Rank.SERVO_CAUSE, share=5.0)
 

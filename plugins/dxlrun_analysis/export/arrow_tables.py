@@ -27,9 +27,9 @@ WITHOUT_TABLE: Mapping[str, str] = {
     LogTopic.DIAGNOSTICS: "temperatures, voltages, hardware errors and modes are in /cycle",
     LogTopic.FRAMES: "the URDF and the positions in /cycle give the frames",
     LogTopic.STILL_FRAMES: "the URDF has these frames",
-    LogTopic.ROBOT_DESCRIPTION: "it is one text, the URDF",
+    LogTopic.ROBOT_DESCRIPTION: "its only message is the URDF",
     LogTopic.ROSOUT: "the same events are in /events",
-    LogTopic.ACTIVATION: "it is one message, the states and goals before the first cycle",
+    LogTopic.ACTIVATION: "its only message has the states and goals before the first cycle",
 }
 """Topics of a log that are not exported as a table, and the reason for each."""
 _ROWS = 4096

@@ -40,7 +40,7 @@ def write_csv(reader: LogReader, target: Path, topic: str) -> int:
             raise LogError(f"{reader.path}: {topic} has no table: {WITHOUT_TABLE[topic]}")
         about = reader.about
         others = {*about.topics, *map(bus_topic, about.buses), CYCLES, EVENTS, COMMANDS} - {topic}
-        raise LogError(f"{reader.path}: it has no records of {topic}; {suggestion(topic, sorted(others))}")
+        raise LogError(f"{reader.path}: no records of {topic}; {suggestion(topic, sorted(others))}")
     return count
 
 

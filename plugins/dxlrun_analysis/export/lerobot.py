@@ -94,9 +94,7 @@ def write_dataset(reader: LogReader, directory: Path) -> int:
         for stretch in _stretches(reader, goals):
             made.write_frames(stretch)
     if made.last is None:
-        raise LogError(
-            f"{reader.path}: it has no cycle in which every joint had a position and a goal, so no frames"
-        )
+        raise LogError(f"{reader.path}: no frames: every cycle lacks the position or the goal of a joint")
     _write_meta(directory, made.last, _features(made.last, goals), made)
     return made.frames
 
@@ -229,14 +227,14 @@ def _check_rate(
     rate = 1e9 / log.period_ns
     if abs(rate - round(rate)) > 1e-6 * rate:
         raise LogError(
-            f"{log.path}: its rate is {rate:g} Hz, and a LeRobot data set has a whole number of frames "
-            "a second"
+            f"{log.path}: a LeRobot data set needs a whole number of frames per second, not a "
+            f"rate of {rate:g} Hz"
         )
     off = np.abs(np.diff(cycles["scheduled_ns"].astype(np.int64)) - steps * log.period_ns)
     if np.any(off[follows] > log.period_ns // 2):
         raise LogError(
-            f"{log.path}: its rate was changed or it was paused in the run, and a LeRobot data set has "
-            "one rate"
+            f"{log.path}: a LeRobot data set needs a constant rate, but the rate was changed, or "
+            "the run was paused"
         )
 
 

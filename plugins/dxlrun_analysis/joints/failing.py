@@ -48,7 +48,7 @@ _SHAKES_HZ = 12.0  # Swings a second; two make one oscillation
 # Bound for effort control by a controller, which is slower than the servo's own position control.
 _SHAKES_BY_EFFORT_HZ = 8.0
 
-_COMMANDED = "See which clients and controllers command it (`/commands` in the log), and let only one."
+_COMMANDED = "Find the clients and controllers that command it (`/commands` in the log), and keep only one."
 
 Flags = NDArray[np.bool_]
 
@@ -84,7 +84,7 @@ class Windows:
         `usual` in which the joint moved."""
         load, otherwise = self.typical(LOAD, when), self.typical(LOAD, usual & (self.mean[SPEED] > 0))
         if math.isnan(load):
-            return "; its load is not read"
+            return "; its load was not read"
         top = self.joint.top_effort
         compared = "" if math.isnan(otherwise) else f", {otherwise / top:.0%} otherwise"
         return f", with {load / top:.0%} of its torque{compared}"
@@ -125,7 +125,7 @@ def joint_finding(code: str, joint: PlannedJoint, text: str, since_s: float, *, 
         since_s: Start of the failure, s since the start of the run.
         brief: The failure lasted less than a second.
     """
-    sentence = f"{joint.name} ({joint.servos}) {text}; from {since_s:.1f} s of the run on."
+    sentence = f"{joint.name} ({joint.servos}) {text}; starting at {since_s:.1f} s of the run."
     return Finding(code, joint.name, sentence, rank=Rank.CAUSE if brief else Rank.SERVO, share=3.0)
 
 
@@ -212,8 +212,8 @@ def _far(one: Windows) -> FollowingFailure | None:
     fastest = (
         one.distance(float(np.nanquantile(steps, 0.9)) / one.length_s) if np.isfinite(steps).any() else ""
     )
-    text = f"was {one.distance(one.typical(AWAY, far))} from its goal for {seconds:.1f} s, and followed "
-    text += f"{moved:.0%} of its way, at up to {fastest}/s{one.load_text(far, ~far)}"
+    text = f"was {one.distance(one.typical(AWAY, far))} from its goal for {seconds:.1f} s, and covered "
+    text += f"{moved:.0%} of the commanded distance, at up to {fastest}/s{one.load_text(far, ~far)}"
     return FollowingFailure("follows_worse", text, far, seconds, shared=True)
 
 
@@ -228,9 +228,9 @@ def _oscillates(one: Windows) -> FollowingFailure | None:
             continue
         text = f"oscillates {one.typical(quantity, when) / 2:.0f} times a second"
         if math.isnan(off):
-            text += " around its goal, to which a controller moves it with an effort"
+            text += " around its goal under effort control"
             return FollowingFailure("oscillates", text, when, seconds)
-        text += ", as its commands do" if when is told else " around its goal"
+        text += ", like its commands" if when is told else " around its goal"
         text += f", {one.distance(off)} away on average{one.load_text(when, ~when)}"
         return FollowingFailure("oscillates", text, when, seconds, commanded=when is told)
     return None
@@ -256,7 +256,9 @@ def _worse(one: Windows) -> FollowingFailure | None:
         return None
     before &= np.cumsum(bad) == 0
     error, usual = one.typical(AWAY, bad), one.typical(AWAY, before)
-    text = f"follows worse than before: {one.distance(error)} away instead of {one.distance(usual)}"
+    text = (
+        f"follows worse than before: with an error of {one.distance(error)} instead of {one.distance(usual)}"
+    )
     return FollowingFailure("follows_worse", text + one.load_text(bad, before), bad, seconds, shared=True)
 
 

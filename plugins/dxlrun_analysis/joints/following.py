@@ -369,7 +369,7 @@ def _follows_worse(mine: _FollowingEvidence, others: Sequence[_FollowingEvidence
     if not _lasts(bad):
         return None
     parts = [text for way, name in _WAYS if (text := _compared(mine.one, name, bad, way))]
-    text = f"follows otherwise than before at the same places: {'; '.join(parts)}"
+    text = f"follows differently than before at the same places: {'; '.join(parts)}"
     found = joint_finding("follows_worse", joint, text, bad[0].at_s, brief=True)
     return found if bad is off else replace(found, rank=Rank.REMARK)
 
@@ -386,7 +386,7 @@ def _compared(one: FollowedJoint, name: str, visits: Iterable[Visit], way: int) 
         return ""
     off, was = (float(np.median([visit[at] for visit in mine])) for at in (3, 4))
     loads = np.array([(each.load, each.load_was) for each in mine if math.isfinite(each.load_was)])
-    text = f"{name} it is off by {math.degrees(off):.1f} deg instead of {math.degrees(was):.1f}"
+    text = f"{name} {math.degrees(off):.1f} deg off instead of {math.degrees(was):.1f}"
     if len(loads):
         load, load_was = np.median(np.abs(loads), axis=0).tolist()
         text += f", with {load:.0%} of its torque instead of {load_was:.0%}"

@@ -140,11 +140,11 @@ class ServoHealth:
 
     def _heat(self, index: int, joint: PlannedJoint, coldest: float, hottest: float) -> Iterable[str]:
         if hottest - coldest > _NONSENSE_C or hottest > _NONSENSE_C:
-            yield f"reads temperatures that it cannot have, from {coldest:.0f} to {hottest:.0f} deg C"
+            yield f"reported impossible temperatures, from {coldest:.0f} to {hottest:.0f} deg C"
             return
         reported = "overheating" in self._faults[index]
         if hottest >= joint.hottest - _NEAR_LIMIT_C:
-            yield f"was hot, at {hottest:.0f} deg C of {joint.hottest:.0f} deg C that it may have"
+            yield f"was hot, at {hottest:.0f} deg C with a limit of {joint.hottest:.0f} deg C"
         elif reported and math.isfinite(hottest):
             yield f"was at {hottest:.0f} deg C"
         if reported:
@@ -175,7 +175,7 @@ class ServoHealth:
             others = np.delete(mean, at, axis=1)
             if not together and self._has_own_supply(mean[:, at], others):
                 reported[at] = False
-                how = f", while the others of bus {bus} had {np.nanmedian(others):.1f} V"
+                how = f", while the other servos of bus {bus} had {np.nanmedian(others):.1f} V"
                 yield self._supply(bus, members[[at]], least[:, [at]], most[:, [at]], how)
         for which, how in (
             (above, ""),
@@ -198,11 +198,11 @@ class ServoHealth:
         where = f"at {joints[0].name} ({joints[0].servos})" if alone else f"of bus {bus}"
         low, high = max(one.lowest_volts for one in joints), min(one.highest_volts for one in joints)
         limits = f"; {low:.1f} to {high:.1f} V are allowed" if math.isfinite(high - low) else ""
-        measured = "is not known"
+        measured = "was not read"
         if np.isfinite(least).any():
             lowest = np.fmin.reduce(least, axis=1)
             at_s = float(np.nanargmin(lowest)) * self._bins.bin_ns / 1e9
-            measured = f"was {np.nanmin(lowest):.1f} V at {at_s:.1f} s of the run, its lowest, and "
+            measured = f"was {np.nanmin(lowest):.1f} V at its lowest ({at_s:.1f} s of the run), and "
             measured += f"{np.nanmax(most):.1f} V at most"
         sentence = f"The supply voltage {where} {measured}{how}{limits}."
         return cause("supply", joints[0].name if alone else bus, sentence, share=4.0)
@@ -228,7 +228,7 @@ class ServoHealth:
 def _how_it_falls(samples: list[_Sample]) -> str:
     volts, load = np.array(samples)[:, 1], np.array(samples)[:, 2]
     by_load, by_time = (abs(np.corrcoef(volts, one)[0, 1]) for one in (load, np.arange(len(volts))))
-    return "; it fell in the course of the run" if by_time > by_load else "; it falls while the load is high"
+    return "; it fell during the run" if by_time > by_load else "; it falls under load"
 
 
 def _falls_with_load(samples: list[_Sample]) -> bool:

@@ -68,9 +68,9 @@ class _Jumps:
 
     def finding(self, joint: PlannedJoint, begin_ns: int) -> Finding:
         """Return the finding that the joint's position jumped; `begin_ns` is the start of the run."""
-        times = "" if self.count == 1 else f" {self.count} times"
+        jumps = "a position jump" if self.count == 1 else f"{self.count} position jumps"
         most, since_s = distance(joint, self.longest), (self.first_ns - begin_ns) * 1e-9
-        text = f"shows a position that jumped{times}, by up to {most}, faster than its model turns"
+        text = f"reported {jumps} of up to {most}, faster than its model turns"
         return joint_finding("position_jumped", joint, text, since_s, brief=True)
 
 
@@ -211,8 +211,8 @@ class Movement:
             yield Finding(
                 "follows_worse",
                 buses.pop() if len(buses) == 1 else "",
-                f"{shared} of {len(found)} joints followed badly at once, or worse than before: it is what "
-                "they share, the line, the supply, the load or the motion.",
+                f"{shared} of {len(found)} joints followed badly at once, or worse than before: the cause "
+                "is common, such as line, supply, load or motion.",
                 rank=Rank.SERVO,
             )
         else:

@@ -102,17 +102,17 @@ class Settings:
             )
         if missing := sorted(set(self.cores) - allowed_cores):
             problems.append(
-                f"--cores: this process may not run on core {', '.join(map(str, missing))}; "
-                f"it may on {', '.join(map(str, sorted(allowed_cores)))}"
+                f"--cores: core {', '.join(map(str, missing))} is not available to this process; "
+                f"choose from {', '.join(map(str, sorted(allowed_cores)))}"
             )
         if self.polling_ns is not None and self.polling_ns * 2 > self.period_ns:
             problems.append(
-                f"--polling {self.polling_ns / 1e3:g} us is more than half of the period, which is the most "
-                "that a loop polls; give less"
+                f"--polling {self.polling_ns / 1e3:g} us is more than half of the period; give "
+                f"{self.period_ns / 2e3:g} us or less"
             )
         if not problems and self.seconds > LONGEST_S:
             problems.append(
-                f"this would take {self.seconds / 3600:.1f} h, and {LONGEST_S / 3600:.0f} h are the most; "
+                f"the measurement would take {self.seconds / 3600:.1f} h, over {LONGEST_S / 3600:.0f} h; "
                 "give fewer iterations, or a shorter period"
             )
         if problems:
@@ -136,17 +136,17 @@ def conditions(compare: str | None, policy: Policy | None) -> tuple[Condition, .
     for number, name in enumerate(names):
         if name not in known:
             raise InputError(
-                f"--compare: {name!r} is not a condition; "
-                f"{suggestion(name, known)}, and write them like other,round_robin,c"
+                f"--compare: {name!r} is not a condition of a list like other,round_robin,c; "
+                f"{suggestion(name, known)}"
             )
         if name in names[:number]:
             raise InputError(f"--compare: {name} is named twice; name each condition once")
     if names == [YARDSTICK]:
         names = [policy or REAL_TIME, YARDSTICK]
     elif len(names) == 1:
-        raise InputError(f"--compare {names[0]}: a comparison takes two; use --policy {names[0]} for one")
+        raise InputError(f"--compare {names[0]}: a comparison needs two; use --policy {names[0]} for one")
     elif policy is not None and YARDSTICK not in names:
-        raise InputError("--policy is for c where conditions are compared, and c is not among them; leave it")
+        raise InputError("with --compare, --policy is only for condition c; add c, or omit --policy")
     return tuple(
         Condition(
             name, (policy or _policy(_neighbour(names, number))) if name == YARDSTICK else _policy(name)

@@ -95,7 +95,7 @@ def measurement(log: LogReader) -> tuple[tuple[Block, ...], Result]:
     try:
         about = msgspec.json.decode(log.metadata[METADATA_NAME]["about"], type=MeasurementDetails)
     except (KeyError, msgspec.MsgspecError) as error:
-        raise LogError(f"{log.path}: the log of a measurement that cannot be read: {error}") from error
+        raise LogError(f"{log.path}: the details of the measurement cannot be read: {error}") from error
     rows = {one.name: _rows(log, f"{_TOPIC}{one.name}") for one in about.settings.conditions}
     blocks = tuple(
         Block(name, number, rows[name][0][rows[name][1] == number], cpu_ns, wall_ns, margin_ns)

@@ -46,7 +46,7 @@ def page(result: Result, blocks: Sequence[Block], machine: str) -> str:
 
 def _sentence(one: Figures) -> str:
     share = (
-        "" if one.processor_share is None else f", and takes {one.processor_share:.1%} of a core for waiting"
+        "" if one.processor_share is None else f", and uses {one.processor_share:.1%} of a core while waiting"
     )
     return (
         f"{one.label} wakes {duration(one.median_us)} late in the median, {duration(one.mean_us)} on "
@@ -57,7 +57,7 @@ def _sentence(one: Figures) -> str:
 def _about(result: Result) -> list[Element]:
     text = (
         f"{counted(result.blocks, 'block', 'blocks')} of each condition in turn, so that the machine's drift "
-        "meets all alike."
+        "affects all equally."
     )
     return [paragraph(text)] if len(result.conditions) > 1 else []
 

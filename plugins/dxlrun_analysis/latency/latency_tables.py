@@ -51,7 +51,7 @@ def statistics_table(result: Result) -> Table:
         ("deadlines skipped", lambda one: flagged(one.skipped)),
         ("polled before each deadline", lambda one: duration(one.polling_us) if one.polling_us else "-"),
         (
-            "share of a core that it takes",
+            "share of a core used",
             lambda one: "-" if one.processor_share is None else f"{one.processor_share:.1%}",
         ),
     )
@@ -69,7 +69,7 @@ def blocks_table(result: Result) -> Table:
     ]
     rows += [
         (
-            f"{_OVER_BLOCKS[name]}, times that of {result.reference}",
+            f"{_OVER_BLOCKS[name]}, relative to {result.reference}",
             *(
                 _interval(one.ratios[name], "{:.3g}".format) if name in one.ratios else "-"
                 for one in result.conditions

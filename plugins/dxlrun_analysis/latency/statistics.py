@@ -128,9 +128,9 @@ def _few(blocks: Sequence[Block]) -> tuple[str, ...]:
     number = 1 + max((block.number for block in blocks), default=-1)
     if 0 < number < FEW_BLOCKS:
         return (
-            f"over {number} block{'s' * (number > 1)} "
-            f"{'the intervals are wide' if number > 1 else 'there is no interval'}: give --blocks "
-            f"{FEW_BLOCKS} or more to compare",
+            f"{number} blocks give wide intervals; give --blocks {FEW_BLOCKS} or more to compare"
+            if number > 1
+            else f"1 block gives no interval; give --blocks {FEW_BLOCKS} or more to compare",
         )
     return ()
 

@@ -68,7 +68,7 @@ def events_plot(canvas: Canvas, events: tuple[Event, ...], number: int) -> Plot:
         plot.hover(drawn, ("event", "@kind"), ("time", "@x{0.000} s"), ("", "@text"))
         plot.named(name, drawn)
     plot.rows([kind.replace("_", " ") for kind in kinds])
-    few = "" if len(events) == number else f"; {len(events)} of them are drawn"
+    few = "" if len(events) == number else f"; {len(events)} are drawn"
     plot.text = f"{counted(number, 'event', 'events')}{few}. Before 0 s the servos are set up."
     return plot
 

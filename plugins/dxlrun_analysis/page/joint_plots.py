@@ -32,7 +32,7 @@ def joint_plots(canvas: Canvas, cycles: Curves, row: int, joint: JointTracking) 
         ],
     )
     position.text = _followed(joint)
-    error = [PlotLine(joint_curve("error", joint.name), "position minus the goal before", PURPLE)]
+    error = [PlotLine(joint_curve("error", joint.name), "position minus previous goal", PURPLE)]
     speed, effort = (_lines(joint.name, quantity) for quantity in ("velocity", "effort"))
     plots = [position]
     for quantity, label, lines, least, times in (
@@ -66,14 +66,14 @@ def _followed(joint: JointTracking) -> str:
     unit, scale = joint.unit.shown, joint.unit.factor
     parts = [
         f"Error rms {joint.rms_rad * scale:.2f} {unit}, worst {joint.worst_rad * scale:.2f} {unit} "
-        "(position minus what was reachable)"
+        "(position minus reachable trajectory)"
     ]
     if joint.lag_ms is not None:
         parts.append(f"lag {joint.lag_ms:.0f} ms")
     if joint.settling_ms is not None:
         parts.append(f"settled after at most {joint.settling_ms:.0f} ms")
     if joint.rest_rad is not None:
-        parts.append(f"at rest off by at most {joint.rest_rad * scale:.2f} {unit}")
+        parts.append(f"error at rest at most {joint.rest_rad * scale:.2f} {unit}")
     return f"{', '.join(parts)}."
 
 

@@ -33,13 +33,13 @@ def latency_plots(canvas: Canvas, run: CurvesOfRun, latency: Latency) -> tuple[P
         f"99.9 % {latency.p999_us:.1f} us, mean {latency.mean_us:.2f} us, standard deviation "
         f"{latency.deviation_us:.2f} us, mode {latency.mode_us} us, maximum {microseconds(latency.max_us)}."
     )
-    series = WakeUps(PlotLine("late", "woken after the deadline", BLUE), run.late_bins)
+    series = WakeUps(PlotLine("late", "delay after the deadline", BLUE), run.late_bins)
     return wake_up_plots(canvas, run.cycles, [series], summary)
 
 
 def steps_plot(canvas: Canvas, cycles: Curves) -> Plot:
     """Return the plot of the duration of each step of the cycle over the run, with the period as a line."""
-    plot = canvas.timed("steps", "Duration of the steps", "duration", 260, log=True)
+    plot = canvas.timed("steps", "Duration of each step", "duration", 260, log=True)
     lines = [
         PlotLine(name, name, _COLOURS[name], width=3.5 if name == "cycle" else 1.2)
         for name, _, _ in reversed(STEPS)
@@ -51,10 +51,10 @@ def steps_plot(canvas: Canvas, cycles: Curves) -> Plot:
     plot.durations("y")
     over = int(np.count_nonzero(cycles.high("cycle") > cycles.low("period")))
     plot.text = (
-        "Read, update and write follow the wake-up; the cycle is their sum. Bands lie between the shortest "
-        "and the longest of the cycles drawn together. "
+        "Read, update and write follow the wake-up; the cycle is their sum. A band spans the shortest and "
+        "longest of the cycles at one point. "
         + (
-            "Here and there a cycle took longer than its period."
+            "Some cycles took longer than their period."
             if over
             else "Every cycle is shorter than its period."
         )
@@ -99,6 +99,6 @@ def typical_plot(canvas: Canvas, steps: Sequence[StepDuration], period_us: float
     words = "; ".join(f"{name} {microseconds(sum(values))}" for name, values in bars[:2])
     plot.text = (
         f"{words[0].upper()}{words[1:]}. The dashed line is the period, {period_us / 1e3:g} ms; the rest "
-        "is idle time. The steps' 99 % and their longest need not come in the same cycle."
+        "is idle time. The 99 % and longest steps can belong to different cycles."
     )
     return plot

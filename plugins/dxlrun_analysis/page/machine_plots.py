@@ -29,7 +29,7 @@ _CORES = (
 )
 _TEXTS = {
     "busy": "User, system and interrupts together.",
-    "steal": "What the host of a virtual machine gave to others.",
+    "steal": "Time given to other guests by the host of a virtual machine.",
 }
 Numbers = NDArray[np.float64]
 
@@ -102,7 +102,7 @@ def machine_plots(canvas: Canvas, machine: Curves, cores: Iterable[int]) -> list
     plots = []
     if "waiting" in machine:
         plot = canvas.timed("machine-waiting", "The loop waited for a core", "ms in each second", 150)
-        canvas.curves(plot, machine, [PlotLine("waiting", "could run, but had no core", ERROR)], "ms", 1.0)
+        canvas.curves(plot, machine, [PlotLine("waiting", "ready to run, no core free", ERROR)], "ms", 1.0)
         plots.append(plot)
     shown = tuple(cores)
     for kind, title, label, unit, least in _CORES:

@@ -24,9 +24,9 @@ def reply_plots(canvas: Canvas, replies: Curves, servos: Sequence[ServoTraffic])
         plot = canvas.timed("replies", "Reply times", "reply time, us", 220)
         canvas.curves(plot, replies, lines, "us", 100.0)
         plot.text = (
-            "From before the instruction is written to after the reply's last byte is read, the quickest and "
-            "the slowest of the replies drawn together; in a read of several servos at once, later ones have "
-            "the replies before theirs in it."
+            "Time from the write of the instruction to the read of the reply's last byte. A band spans the "
+            "fastest and slowest replies at one point. In a read of several servos, each time includes the "
+            "preceding replies."
         )
         plots.append(plot)
     lost = {key: name for key, name in names.items() if f"lost {key}" in replies}
@@ -56,7 +56,7 @@ def _lost(canvas: Canvas, replies: Curves, lost: dict[str, str]) -> Plot:
     drawn = plot.model.scatter("x", "y", source=source, **style)
     plot.hover(drawn, ("servo", "@servo"), ("time", "@x{0.000} s"))
     plot.rows(list(lost.values()))
-    plot.text = "A tick where one or more replies in a row of the time that is drawn together are missing."
+    plot.text = "Each tick marks one or more missing replies."
     return plot
 
 

@@ -157,7 +157,7 @@ def _sections(run: _PageContent, report: Report) -> list[Element]:
 
     return [
         section("joints", "Joints", [*build_tables("joints"), *_joints(run, report)]),
-        section("steering", "Steered from outside", [*build_tables("steering"), *_marks(canvas)]),
+        section("steering", "Requests of clients", [*build_tables("steering"), *_marks(canvas)]),
         section("events", "Events", _events(run, report, build_tables("events"))),
         section(
             "buses",
@@ -175,7 +175,7 @@ def _sections(run: _PageContent, report: Report) -> list[Element]:
         ),
         folded(
             "machine",
-            "The machine and all versions",
+            "Machine and versions",
             [
                 *map(table_element, facts(run.log, report)),
                 *canvas.elements(machine_plots(canvas, run.machine, run.cores)),
@@ -209,10 +209,10 @@ def _joints(run: _PageContent, report: Report) -> list[Element]:
     canvas, cycles = run.canvas, run.curves.cycles
     parts = [
         paragraph(
-            "Desired is the controllers' command, sent is the goal after the gate, read is what the "
-            "servo reported. The error is the position that was read minus the goal of the cycle before, "
-            "with the servo's delay in it. Ticks mark cycles without an intact reply, and those whose "
-            "command the gate changed (clamped). A click on a name hides its curve."
+            "Desired is the controllers' command, sent is the goal after the gate, read is the value "
+            "reported by the servo. The error is the read position minus the previous goal, and includes "
+            "the servo's delay. Ticks mark cycles without an intact reply, and cycles with a command "
+            "changed by the gate (clamped). A click on a name hides its curve."
         )
     ]
     for row, joint in enumerate(report.totals.tracking):
@@ -224,7 +224,7 @@ def _joints(run: _PageContent, report: Report) -> list[Element]:
 
 def _marks(canvas: Canvas) -> list[Element]:
     marks = ["Shaded: the loop was paused."] if canvas.pauses else []
-    marks += ["Dotted lines: it was steered otherwise."] if canvas.changes else []
+    marks += ["Dotted lines: controllers, rate or policy were changed."] if canvas.changes else []
     return [paragraph(f"In the plots over the time of the run: {' '.join(marks)}")] if marks else []
 
 

@@ -46,7 +46,7 @@ def _lateness(canvas: Canvas, curves: Curves, lines: Sequence[PlotLine], summary
     worst = max(float(np.nanmax(curves.high(line.curve))) for line in lines)
     plot.model.y_range = Range1d(0.6, 2 * max(worst, ROUGH_US))
     plot.durations("y")
-    plot.text = f"{summary} The dashed line is at 150 us. What is below 1 us is drawn at 1 us."
+    plot.text = f"{summary} The dashed line is at 150 us. Latencies below 1 us are drawn at 1 us."
     return plot
 
 
@@ -72,8 +72,8 @@ def _histogram(canvas: Canvas, series: Sequence[WakeUps]) -> Plot:
             of = f" of {line.name}"
         count, beyond = int(bins.sum()), int(bins[ROUGH_US + 1 :].sum())
         notes.append(
-            f"{beyond} of {count} wake-ups{of} ({beyond / count:.3%}) are later than 150 us and lie beyond "
-            "the right edge."
+            f"{beyond} of {count} wake-ups{of} ({beyond / count:.3%}) are later than 150 us, beyond the "
+            "right edge."
             if beyond
             else f"No wake-up{of} is later than 150 us."
         )
@@ -86,7 +86,7 @@ def _histogram(canvas: Canvas, series: Sequence[WakeUps]) -> Plot:
 
 
 def _cumulative(canvas: Canvas, series: Sequence[WakeUps]) -> Plot:
-    axes = ("wake-up latency (logarithmic)", "share of wake-ups up to it (logit)")
+    axes = ("wake-up latency (logarithmic)", "cumulative share of wake-ups (logit)")
     plot = canvas.free("latency-cumulative", "Cumulative distribution of the wake-ups", axes, 260, log="x")
     latest, longest = ROUGH_US, 0
     for line, bins in series:
@@ -112,7 +112,7 @@ def _cumulative(canvas: Canvas, series: Sequence[WakeUps]) -> Plot:
         "point is the largest delay. The dashed line is at 150 us."
     )
     if latest == LATE_BINS_US:
-        plot.text += f" What is later than {LATE_BINS_US // 1000} ms is drawn there."
+        plot.text += f" Latencies above {LATE_BINS_US // 1000} ms are drawn there."
     return plot
 
 

@@ -119,8 +119,8 @@ def _span(unit: str) -> tuple[tuple[str, str], ...]:
 
 def _caption(one: WorstCycle, drawn: int) -> str:
     text = (
-        "Dashed: when the cycle was due, and the end of its period. A reply's bar goes from its first byte "
-        "to its last as they were read; the diamond is where the plan expects the last one."
+        "Dashed: due time of the cycle, and end of its period. A reply's bar goes from its first byte to "
+        "its last as read; the diamond is the planned time of the last byte."
     )
     more = len(one.packets) - drawn
     return f"{text} {more} more packets are not drawn." if more else text

@@ -26,8 +26,8 @@ def _error(name: str) -> Callable[[JointTracking], Value]:
 
 
 def _joints(_: Report, joints: Sequence[JointTracking]) -> Table:
-    mm = ", of linear joints in mm" if any(joint.unit.suffix for joint in joints) else ""
-    return Table.listing(f"Joints (errors in deg{mm}, of position minus what was reachable)", _JOINT, joints)
+    mm = ", linear joints in mm" if any(joint.unit.suffix for joint in joints) else ""
+    return Table.listing(f"Joints (errors in deg{mm}: position minus reachable trajectory)", _JOINT, joints)
 
 
 _SERVO: Columns[ServoTraffic] = (

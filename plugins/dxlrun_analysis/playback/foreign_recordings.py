@@ -130,8 +130,8 @@ def _nothing(recording: _Recording, playable: Sequence[str], what: What | None, 
     more = f" and {len(names) - 10} more" if len(names) > 10 else ""
     damage = "".join(f"; {remark}" for remark in recording.remarks)
     return (
-        f"{recording.path}: no message of sensor_msgs/JointState or trajectory_msgs/JointTrajectory in "
-        f"CDR{asked}, so there is no motion in it; its topics are {shown or 'none'}{more}{damage}"
+        f"{recording.path}: no motion: no sensor_msgs/JointState or trajectory_msgs/JointTrajectory "
+        f"message in CDR{asked}; its topics are {shown or 'none'}{more}{damage}"
     )
 
 
@@ -153,7 +153,7 @@ def _moments(message: _PositionMessage) -> _Moments:
         rows = [cast("Floats", point["positions"]) for point in points]
         after_s = np.array([_time_ns(point["time_from_start"]) * 1e-9 for point in points])
     if any(len(row) != len(names) for row in rows):
-        raise ValueError(f"{message.topic} has not one position for each joint of a message")
+        raise ValueError(f"{message.topic} has a message with unequal numbers of joints and positions")
     positions = np.array(rows, dtype=np.float64).reshape(len(rows), len(names))
     return _Moments(message.topic, what, start_ns, tuple(map(str, names)), after_s, positions)
 
@@ -171,7 +171,7 @@ def _series(path: Path, moments: Sequence[_Moments]) -> dict[str, Series]:
     twice = sorted(joint for joint, names in topics.items() if len(names) > 1)
     if twice:
         shown = ", ".join(sorted(topics[twice[0]]))
-        raise InputError(f"{path}: {twice[0]} is in several topics ({shown}); choose one by --topic")
+        raise InputError(f"{path}: {twice[0]} is in several topics ({shown}); choose a topic by --topic")
     began_ns = min(one.start_ns for one in moments)
     times: dict[str, list[Floats]] = {joint: [] for joint in topics}
     positions: dict[str, list[Floats]] = {joint: [] for joint in topics}
@@ -222,7 +222,7 @@ def _files(path: Path) -> list[Path]:
         content = yaml.safe_load((path / BAG_FILE).read_text(encoding="utf-8"))
         names = [str(name) for name in content["rosbag2_bagfile_information"]["relative_file_paths"]]
     except (OSError, UnicodeDecodeError, yaml.YAMLError, LookupError, TypeError) as error:
-        raise InputError(f"{path}: its {BAG_FILE} is not that of a ROS 2 bag: {_said(error)}") from error
+        raise InputError(f"{path}: not a ROS 2 bag: {BAG_FILE} is invalid: {_said(error)}") from error
     # The files are next to metadata.yaml, whatever path it contains.
     files = [path / Path(name).name for name in names]
     missing = [file.name for file in files if not file.is_file()]
@@ -246,11 +246,11 @@ def _read(file: Path, recording: _Recording) -> None:
                 _read_mcap(file, recording)
             elif head[: len(_ZSTD)] == _ZSTD:
                 raise InputError(
-                    f"{file}: the file is compressed as a whole; `zstd -d {file.name}` expands it"
+                    f"{file}: the whole file is compressed; expand it with `zstd -d {file.name}`"
                 )
             else:
                 raise InputError(
-                    f"{file}: neither MCAP nor sqlite3; only recordings of these formats can be played"
+                    f"{file}: neither MCAP nor sqlite3; play a recording in one of these formats"
                 )
     except OSError as error:
         raise InputError(f"{file}: cannot be read: {error.strerror or error}") from error

@@ -141,8 +141,8 @@ def player_of(joint: str, plans: Sequence[ControllerPlan]) -> str | None:
 def _plans_of(motion: RecordedMotion) -> Sequence[ControllerPlan]:
     if motion.plan is None:
         raise InputError(
-            f"{motion.path}: a foreign recording does not say which controllers are to play it; name one "
-            "that takes trajectories by --controller"
+            f"{motion.path}: a foreign recording does not name its controllers; name a trajectory "
+            "controller by --controller"
         )
     return _logged_loop(motion).controllers
 
@@ -178,12 +178,12 @@ def _parts(motion: RecordedMotion, plans: Sequence[ControllerPlan] | None) -> li
             )
     if missing:
         raise InputError(
-            f"{motion.path}: no controller that was active at its start takes motions for "
+            f"{motion.path}: no controller active at the start plays motions of "
             f"{', '.join(missing)}; name one by --controller, or choose other joints by --joint"
         )
     wanting = [
-        f"{motion.path}: {plan.name} moves {', '.join(others)} too, and a motion file needs all its joints; "
-        "convert these too, or name another controller by --controller"
+        f"{motion.path}: a motion file needs all joints of {plan.name}; convert {', '.join(others)} too, "
+        "or name another controller by --controller"
         for plan in plans
         if plan.name in parts
         and (others := [joint for joint in plan.joints if joint not in parts[plan.name].joints])

@@ -85,9 +85,9 @@ class Stretch(msgspec.Struct, frozen=True):
         """
         for option, value in (("--from", self.begin_s), ("--to", self.end_s)):
             if value is not None and not (math.isfinite(value) and value >= 0):
-                raise InputError(f"{option} {value:g}: give seconds since the recording's beginning")
+                raise InputError(f"{option} {value:g}: give seconds since the start of the recording")
         if self.begin_s is not None and self.end_s is not None and self.begin_s >= self.end_s:
-            raise InputError(f"--from {self.begin_s:g} is not before --to {self.end_s:g}; turn them round")
+            raise InputError(f"--from {self.begin_s:g} is not before --to {self.end_s:g}; swap them")
 
 
 WHOLE = Stretch()
@@ -149,7 +149,7 @@ def motion_of(
     known = {name: names.get(name, name) for name in series}
     taken = [joint for joint in known.values() if joint]
     wrong += [
-        f"{path}: --map leads several recorded joints to {joint}; omit all but one by RECORDED="
+        f"{path}: --map gives several recorded joints the name {joint}; omit all but one by RECORDED="
         for joint in dict.fromkeys(taken)
         if taken.count(joint) > 1
     ]
@@ -161,7 +161,7 @@ def motion_of(
 
 def _joined(path: Path, series: Mapping[str, Series], stretch: Stretch) -> RecordedMotion:
     if not series:
-        raise InputError(f"{path}: no joint is left to be played")
+        raise InputError(f"{path}: no joint is left to play; keep at least one")
     silent = [joint for joint, one in series.items() if not len(one.time_s)]
     if silent:
         raise InputError(f"{path}: the recording has no position of {', '.join(silent)}")
@@ -171,18 +171,17 @@ def _joined(path: Path, series: Mapping[str, Series], stretch: Stretch) -> Recor
     end_s = last_s if stretch.end_s is None else min(last_s, stretch.end_s)
     if end_s <= begin_s:
         raise InputError(
-            f"{path}: there is no motion between --from and --to: all joints have positions from "
-            f"{first_s:.3f} s to {last_s:.3f} s"
+            f"{path}: no motion between --from and --to; choose times from {first_s:.3f} s to {last_s:.3f} s"
             if stretch != WHOLE and last_s > first_s
-            else f"{path}: its joints have no positions over a common time, so there is no motion to play"
+            else f"{path}: no motion: the times of its joints do not overlap; omit joints by --joint"
         )
     cut = {joint: one.between(begin_s, end_s) for joint, one in series.items()}
     _check_holes(path, cut, series, begin_s, end_s)
     times = np.unique(np.concatenate([[begin_s, end_s], *(one.time_s for one in cut.values())]))
     if len(times) * len(cut) > MOST_NUMBERS:
         raise InputError(
-            f"{path}: {len(times)} moments of {len(cut)} joints are more than can be played at once; choose "
-            "a stretch by --from and --to"
+            f"{path}: {len(times)} rows of {len(cut)} joints are too many to play at once; choose a "
+            "stretch by --from and --to"
         )
     position = np.stack([np.interp(times, one.time_s, one.position) for one in series.values()], axis=1)
     what = tuple(one.what for one in series.values())
@@ -204,6 +203,6 @@ def _check_holes(
             holes.append(f"of {joint} from {times[at]:.3f} s to {times[at + 1]:.3f} s")
     if holes:
         raise InputError(
-            f"{path}: the recording has no positions {', '.join(holes)}; choose a stretch without that by "
+            f"{path}: the recording has no positions {', '.join(holes)}; choose a stretch without gaps by "
             "--from and --to"
         )

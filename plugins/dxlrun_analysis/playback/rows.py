@@ -91,13 +91,13 @@ def rows_of(
     wrong = _all_beyond(plans, played, allowed)
     if wrong:
         enough = _slow_enough(plans, played, path, period_s, allowed)
-        wrong += [f"at --speed {enough:g} it is within all of them"] if enough else []
+        wrong += [f"write --speed {enough:g} to stay within all limits"] if enough else []
         raise InputError("\n".join(f"{motion.path}: {sentence}" for sentence in wrong))
     if played.period_s > max(LONGEST_PERIOD_S, period_s):
         most_s = MOST_NUMBERS // len(plans) * max(LONGEST_PERIOD_S, period_s)
         raise InputError(
-            f"{motion.path}: {played.at_s[-1]:.0f} s of {len(plans)} joints are longer than can be played at "
-            f"once, {most_s:.0f} s; choose a stretch by --from and --to"
+            f"{motion.path}: {played.at_s[-1]:.0f} s of {len(plans)} joints are too long to play at once, at "
+            f"most {most_s:.0f} s; choose a stretch by --from and --to"
         )
     for column, plan in enumerate(plans):
         if plan.bounded:

@@ -54,14 +54,12 @@ def read_motion(
     """
     stretch.validate_times()
     if not path.exists():
-        raise InputError(f"there is no log {path}; a run prints the path of its log when it ends")
+        raise InputError(f"log {path} not found; a run prints the path of its log when it ends")
     plan = None
     if is_foreign(path):
         series, remarks = foreign_series(path, what, topic)
     elif topic is not None:
-        raise InputError(
-            f"--topic {topic}: {path} is a log of dxlrun, whose goals or states are chosen by --what"
-        )
+        raise InputError(f"--topic {topic}: {path} is a log of dxlrun; choose its goals or states by --what")
     else:
         series, remarks, plan = _own_series(path, what, stretch)
     kept = chosen(path, series, only)
@@ -82,7 +80,7 @@ def _own_series(
             columns[field].append(piece.cycles[field].copy())
     cycles = {field: np.concatenate(rows) for field, rows in columns.items() if rows}
     if not cycles or not len(cycles["scheduled_ns"]):
-        raise LogError(f"{path}: the log has no cycles, so there is no motion in it")
+        raise LogError(f"{path}: no motion: the log has no cycles")
     time_s = (cycles["scheduled_ns"] - cycles["scheduled_ns"][0]) * 1e-9
     begin, end = stretch.begin_s or 0.0, math.inf if stretch.end_s is None else stretch.end_s
     inside = (time_s >= begin) & (time_s <= end)

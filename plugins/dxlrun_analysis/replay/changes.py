@@ -95,7 +95,7 @@ def _changed(plan: ControllerPlan, setting: Setting) -> ControllerPlan:
     for key in setting.parameter[:-1]:
         place = place.setdefault(key, {})
         if not isinstance(place, dict):
-            raise InputError(f"--set {plan.name}.{'.'.join(setting.parameter)}: {key} has no parts")
+            raise InputError(f"--set {plan.name}.{'.'.join(setting.parameter)}: {key} is not a mapping")
     place[setting.parameter[-1]] = setting.value
     return replace(plan, parameters=json.dumps(parameters, default=str))
 
@@ -114,23 +114,23 @@ def with_arguments(plan: RecordedPlan, loop: LoopPlan, arguments: Mapping[str, s
     same = _compiled(plan, plan.arguments)
     if (same.joints, same.controllers) != (plan.loop.joints, plan.loop.controllers):
         raise InputError(
-            "the robot file in the log no longer gives the plan that was run (other versions, or servos "
-            "whose models are known only at a start): its arguments cannot be changed; --set can"
+            "the robot file in the log no longer compiles to the plan of the run (other versions, or servo "
+            "models known only at start-up); use --set in place of arguments"
         )
     other = _compiled(plan, {**plan.arguments, **arguments})
     if other.period_ns != loop.period_ns:
         raise InputError(
             f"the arguments change the loop's period from {loop.period_ns} ns to {other.period_ns} ns, but "
-            "the recorded inputs came with the old one; leave the rate as it is"
+            "the recorded inputs have the old one; keep the rate"
         )
     names = [tuple(one.name for one in each) for each in (other.joints, loop.joints)]
     others = [tuple(one.name for one in each) for each in (other.controllers, loop.controllers)]
     if names[0] != names[1] or others[0] != others[1]:
-        raise InputError("the arguments change the joints or controllers; the log has the old ones")
+        raise InputError("the arguments change the recorded joints or controllers; change only parameters")
     if other.references != loop.references:
-        raise InputError("the arguments change the references; the log has the old ones")
+        raise InputError("the arguments change the recorded references; change only parameters")
     if other.source_states != loop.source_states:
-        raise InputError("the arguments change the devices, sensors or states; the log has the old ones")
+        raise InputError("the arguments change recorded devices, sensors or states; change only parameters")
     return replace(loop, joints=other.joints, controllers=other.controllers)
 
 

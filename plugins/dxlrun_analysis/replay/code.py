@@ -35,7 +35,7 @@ def with_code(plan: RecordedPlan, choice: CodeChoice | None) -> tuple[RecordedPl
     changed = sorted(name for name, text in code.items() if now[name] != text)
     if choice == "log":
         return plan, tuple(
-            f"{name} has changed since the run; the replay ran the one in the log" for name in changed
+            f"{name} has changed since the run; the replay ran the version in the log" for name in changed
         )
     missing = [name for name in changed if now[name] is None]
     if choice is None and changed:
@@ -59,8 +59,8 @@ def _text(folder: Path, name: str) -> str | None:
 
 def _refusal(folder: Path, name: str, *, gone: bool) -> str:
     state = "cannot be read" if gone else "has changed since the run"
-    current = "" if gone else "--code current runs the file as it is now, "
+    current = "" if gone else "--code current to run the present file, or "
     return (
-        f"{folder / name} {state}, and the code in a log is not executed unasked; "
-        f"{current}--code log runs what is in the log: only if you trust who sent it"
+        f"{folder / name} {state}; write {current}--code log to run the code in the log "
+        "if you trust its sender"
     )

@@ -87,14 +87,14 @@ class Comparison:
         if record.cycle == row["cycle"] and record.scheduled_ns != row["scheduled_ns"]:
             raise LogError(
                 f"cycle {record.cycle} was due {self._since_start(int(row['scheduled_ns']))} in the run and "
-                f"{self._since_start(record.scheduled_ns)} in the replay: a change of the rate in the log is "
-                "not the one that was made, or the dxlrun that made the log counts in another way"
+                f"{self._since_start(record.scheduled_ns)} in the replay: the log is damaged, or "
+                "from an incompatible version of dxlrun"
             )
         if record.cycle != row["cycle"] or record.period_ns != row["period_ns"]:
             raise LogError(
-                f"cycle {int(row['cycle'])} was given a period of {int(row['period_ns'])} ns in the run and "
-                f"cycle {record.cycle} {record.period_ns} ns in the replay: the log is damaged, or was made "
-                "by a dxlrun whose loop counts in another way"
+                f"cycle {int(row['cycle'])} had a period of {int(row['period_ns'])} ns in the run, and cycle "
+                f"{record.cycle} {record.period_ns} ns in the replay: the log is damaged, or from an "
+                "incompatible version of dxlrun"
             )
         active, recorded_active = record.active & _MASK, int(row["active"]) & _MASK
         differ = active != recorded_active
@@ -131,7 +131,7 @@ class Comparison:
         states = [("active" if mask >> bit & 1 else "not active") for mask in (recorded, active)]
         plans = self._controllers()
         # A controller that the replay could not load has no name here.
-        name = plans[bit].name if bit < len(plans) else f"number {bit}, loaded in the run"
+        name = plans[bit].name if bit < len(plans) else f"number {bit} of the run"
         return self._inputs.difference(index, "active", None, name, *states)
 
     def _named(self, field: str, place: int, active: int) -> tuple[str, str | None, str | None]:

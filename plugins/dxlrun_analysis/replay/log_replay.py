@@ -119,7 +119,7 @@ def replay_log(
     messages.report_missing((int(woken_ns[comparison.compared - 1]) if comparison.compared else -1) - early)
     # Within a cycle, a difference appears first in a prepared array, then in the command, then in a message.
     firsts = [one for one in (prepared.first, comparison.first, messages.first) if one is not None]
-    fault = f"the replay ended: {result.detail or 'its policy was done'}" if early else ""
+    fault = f"the replay ended: {result.detail or 'its policy ended'}" if early else ""
     return ReplayReport(
         log=str(reader.path),
         robot=inputs.plan.robot,
@@ -150,8 +150,8 @@ def replay_log(
 def _offered(log: Path, loop: LoopPlan, plugins: PlugIns) -> None:
     """Raise PlugInError with a line for each controller of the log whose type no plug-in offers here."""
     missing = [
-        f"{log}: no plug-in offers the type {one.type} of controller {one.name}; the run had it from "
-        f"{one.distribution or 'another package'}: install that"
+        f"{log}: no plug-in offers the type {one.type} of controller {one.name}; install "
+        f"{one.distribution or 'its package'}"
         for one in loop.controllers
         if one.type not in plugins.controllers
     ]

@@ -61,7 +61,7 @@ class MessageComparison(MessageSink):
         """Sentence about messages that the log lacks; empty if it has all."""
         if not self.lost:
             return ()
-        return (f"the log misses {counted(self.lost, 'message', 'messages')} of topics",)
+        return (f"the log lacks {counted(self.lost, 'message', 'messages')} of topics",)
 
     def add_messages(self, part: Log) -> None:
         """Add the recorded messages of a slice of the log."""

@@ -108,15 +108,13 @@ def _beginning(log: Log) -> np.void:
     """
     path, cycles = log.path, log.cycles
     if not len(cycles):
-        raise LogError(
-            f"{path}: there is nothing to replay: the loop finished no cycle, or the log lost them"
-        )
+        raise LogError(f"{path}: nothing to replay: the loop finished no cycle, or the log lost all cycles")
     if log.activation is None or int(cycles["cycle"][0]) != int(cycles["skipped"][0]):
         begins = f"begins with cycle {int(cycles['cycle'][0])}"
         raise LogError(
-            f"{path}: a replay needs the run's beginning, and this log "
-            f"{begins if int(cycles['cycle'][0]) else 'has no /activation'}; of a log in parts give the "
-            "directory, with its first part"
+            f"{path}: a replay needs the start of the run, but this log "
+            f"{begins if int(cycles['cycle'][0]) else 'has no /activation'}; give the directory with all "
+            "parts of the log"
         )
     activation: np.void = log.activation[0]
     return activation
@@ -129,7 +127,7 @@ def version_remarks(inputs: RecordedInputs, plugins: PlugIns) -> tuple[str, ...]
     for name in _LIBRARIES:
         now = metadata.version(name)
         if then.get(name, now) != now:
-            sentences.append(f"{name} was {then[name]} in the run and is {now} in the replay")
+            sentences.append(f"{name} has version {then[name]} in the run and {now} in the replay")
     for was in sorted({(plan.type, plan.distribution) for plan in inputs.plan.loop.controllers}):
         offer = plugins.controllers.get(was[0])
         if offer is not None and offer.distribution != was[1]:
@@ -150,8 +148,8 @@ def _plan(log: Log) -> RecordedPlan:
     contract = log.metadata.get("versions", {}).get("contract", str(CONTRACT_VERSION))
     if contract not in map(str, range(1, CONTRACT_VERSION + 1)):
         raise LogError(
-            f"{log.path}: the run's controllers were made for contract {contract}, this dxlrun has contract "
-            f"{CONTRACT_VERSION}: replay it with the dxlrun that made it, {_version(log)}"
+            f"{log.path}: the controllers of the run have contract {contract}, this dxlrun has contract "
+            f"{CONTRACT_VERSION}; replay the log with dxlrun {_version(log)}"
         )
     data = log.attachments.get(PLAN)
     if data is None:
@@ -160,19 +158,19 @@ def _plan(log: Log) -> RecordedPlan:
         plan = decode_plan(data, RecordedPlan)
     except UNREADABLE as error:
         raise LogError(
-            f"{log.path}: the plan in the log is not one of this dxlrun ({error}): replay it with the dxlrun "
-            f"that made it, {_version(log)}"
+            f"{log.path}: this dxlrun cannot read the plan in the log ({error}); replay the log with "
+            f"dxlrun {_version(log)}"
         ) from error
     if tuple(joint.name for joint in plan.loop.joints) != log.joints:
-        raise LogError(f"{log.path}: the plan in the log has other joints than its cycles")
+        raise LogError(f"{log.path}: the log is damaged: plan and cycles differ in joints")
     if tuple(controller.name for controller in plan.loop.controllers) != tuple(
         controller.name for controller in log.controllers
     ):
-        raise LogError(f"{log.path}: the plan in the log has other controllers than its cycles")
+        raise LogError(f"{log.path}: the log is damaged: plan and cycles differ in controllers")
     if plan.loop.references != log.header.references:
-        raise LogError(f"{log.path}: the plan in the log has other references than its cycles")
+        raise LogError(f"{log.path}: the log is damaged: plan and cycles differ in references")
     if plan.loop.source_states != log.header.sources:
-        raise LogError(f"{log.path}: the plan in the log has other devices and sensors than its cycles")
+        raise LogError(f"{log.path}: the log is damaged: plan and cycles differ in devices and sensors")
     _check_controllers(log, plan.loop)
     return plan
 
@@ -182,10 +180,9 @@ def _check_controllers(log: Log, loop: LoopPlan) -> None:
     for controller in loop.controllers:
         unknown = set(controller.joints) - set(log.joints)
         if unknown or controller.every < 1:
-            what = f"no joint {min(unknown)}" if unknown else f"no rate divider {controller.every}"
+            what = f"the unknown joint {min(unknown)}" if unknown else f"the rate divider {controller.every}"
             raise LogError(
-                f"{log.path}: there is {what}, as controller {controller.name} has it in the plan: "
-                "the log is damaged"
+                f"{log.path}: the log is damaged: controller {controller.name} of the plan has {what}"
             )
 
 
@@ -241,8 +238,8 @@ def _check_commands(log: Log) -> None:
         at = _index_of(log, command.cycle)
         if command is not policy and at is not None and int(log.cycles["woken_ns"][at]) != command.t_ns:
             raise LogError(
-                f"{log.path}: a command ({command.kind}) that cycle {command.cycle} took has not its time: "
-                "the log is damaged"
+                f"{log.path}: the log is damaged: a command ({command.kind}) and its cycle "
+                f"{command.cycle} have different times"
             )
 
 
@@ -264,7 +261,7 @@ def _until_hole(log: Log) -> tuple[int, int, str]:
     if hole >= end:
         return end, ends, stopped
     number = int(log.cycles["cycle"][hole])
-    lost = f"what the controllers knew after that is lost, so from cycle {number} on nothing is compared"
+    lost = f"the state of the controllers is unknown from cycle {number} on, so the comparison ends"
     return hole, ends, f"{why}; {lost}"
 
 
@@ -291,8 +288,8 @@ def _first_hole(log: Log) -> tuple[int, str]:
     at = int(np.argmax(gap | missing))
     if gap[at]:
         first, last = int(number[at - 1]) + 1, int(number[at]) - 1
-        return at, f"the log misses cycles between {first} and {last}{because}"
-    return at, f"the log misses a command that cycle {int(number[at])} took{because}"
+        return at, f"the log lacks cycles between {first} and {last}{because}"
+    return at, f"the log lacks a command of cycle {int(number[at])}{because}"
 
 
 def _until_policy(log: Log, usable: int) -> tuple[int, int, str]:
@@ -309,12 +306,12 @@ def _until_policy(log: Log, usable: int) -> tuple[int, int, str]:
         ends = int(np.searchsorted(cycles["woken_ns"], begun[0], side="right")) if begun else usable
         if ends >= usable:
             return usable, usable, ""
-        return ends, ends, f"the log misses in which cycle a policy began after cycle {ends - 1}"
+        return ends, ends, f"the log lacks the start of a policy after cycle {ends - 1}"
     ends = min(usable, int(np.searchsorted(cycles["cycle"], policy.cycle)))
     if 0 < ends < usable:
         passed_ns = int(cycles["woken_ns"][ends]) - int(cycles["woken_ns"][ends - 1])
         if policy.t_ns != int(cycles["woken_ns"][ends - 1]) and int(cycles["period_ns"][ends]) < passed_ns:
-            return ends, ends, f"a bus failed in cycle {policy.cycle}; what came after it is not compared"
+            return ends, ends, f"a bus failed in cycle {policy.cycle}; later cycles are not compared"
     return usable, ends, ""
 
 
@@ -324,7 +321,7 @@ def _loop(log: Log, plan: LoopPlan) -> LoopPlan:
     taken = {command.planned for command in log.commands if command.planned >= 0}
     if beyond := sorted(number for number in taken if number >= len(plan.commands)):
         cycle = next(command.cycle for command in log.commands if command.planned == beyond[0])
-        raise LogError(f"{log.path}: cycle {cycle} took a command that the plan in the log has not")
+        raise LogError(f"{log.path}: the plan in the log lacks a command of cycle {cycle}")
     return replace(
         plan,
         commands=tuple(command for number, command in enumerate(plan.commands) if number in taken),
@@ -342,5 +339,5 @@ def _policies(log: Log, policies: PolicyPlan) -> PolicyPlan:
     try:
         policy = policies.named(msgspec.json.decode(begun.data, type=_PolicyStart).policy)
     except (*UNREADABLE, KeyError) as error:
-        raise LogError(f"{log.path}: the log does not say which policy began: {error}") from error
+        raise LogError(f"{log.path}: the policy that began cannot be read: {error}") from error
     return replace(policies, on_exit=policy)

@@ -31,7 +31,7 @@ Row = dict[str, object]
 Progress = Callable[[str, float], None]
 _MEASUREMENT = "latency"  # Metadata record of a log that `dxlrun latency` wrote
 _LOG, _LEDGER = ".mcap", ".ledger.jsonl"
-_ENDED = "the process that read it ended: it crashed, or had too little memory"
+_ENDED = "the process reading the log crashed or ran out of memory"
 _SETTLED_NS = 2_000_000_000
 """Age from which a file's state counts as final: the coarsest time resolution of file systems (2 s of
 FAT). A file that changed more recently can change again without a new time stamp."""
@@ -174,7 +174,7 @@ def find_logs(directory: Path) -> Folder:
             elif not name.startswith(".") and not _belongs(name, files):
                 others.append(_name(path, directory))
     if not logs:
-        raise InputError(f"{directory}: there are no logs (.mcap) in it or below it")
+        raise InputError(f"{directory}: no logs (.mcap) found in this directory or below")
     return Folder(directory, tuple(sorted(logs, key=lambda log: log.name)), tuple(others))
 
 

@@ -27,8 +27,8 @@ from dxlrun.tooling.verbs import missing_extra
 from dxlrun_analysis.season.season_runs import SCHEMA, Folder, FoundLog, Progress, Row, kept_table, table_of
 
 _ROW, _LOG = ".run.json", ".mcap"
-UNFINISHED = "its upload has not ended; `dxlrun upload` of its robot continues it"
-DAMAGED = f"its row in the store (NAME{_ROW}) is damaged; `dxlrun upload` of its robot writes it again"
+UNFINISHED = "incomplete upload; continue with `dxlrun upload` on its robot"
+DAMAGED = f"damaged row in the store (NAME{_ROW}); rewrite the row with `dxlrun upload` on its robot"
 _AT_ONCE = 500
 """Number of rows that are requested from the store together."""
 _OPTIONS: Mapping[str, Mapping[str, object]] = {
@@ -183,11 +183,11 @@ def _opened(url: str) -> tuple[fsspec.AbstractFileSystem, str]:
     """Return the file system of a store's URL, and the path in it."""
     protocol, _, path = url.partition("://")
     if protocol not in _OPTIONS:
-        raise InputError(f"{url}: no such store; write s3://BUCKET/PREFIX or file:///DIRECTORY")
+        raise InputError(f"{url}: unknown kind of store; write s3://BUCKET/PREFIX or file:///DIRECTORY")
     if protocol == "s3" and (missing := missing_extra("a store of S3", "store", "s3fs")):
         raise InputError(missing)
     if not path.strip("/"):
-        raise InputError(f"{url}: it names no bucket or directory; write s3://BUCKET/PREFIX")
+        raise InputError(f"{url}: bucket or directory is missing; write s3://BUCKET/PREFIX")
     files, root = fsspec.core.url_to_fs(url, **_OPTIONS[protocol])
     return files, root.rstrip("/")
 

@@ -63,7 +63,7 @@ class BrokenReplies:
         if noisy < max(_FEWEST_NOISY, _NOISY_SHARE * asked):
             return ()
         after = f"{counted(noisy, 'instruction', 'instructions')} of {asked}"
-        sentence = f"Noise on bus {bus.name}: bytes that belong to no packet came after {after}."
+        sentence = f"Noise on bus {bus.name}: stray bytes followed {after}."
         return (cause("noise", bus.name, sentence, share=noisy / max(asked, 1)),)
 
     def _broken_ones(
@@ -85,6 +85,6 @@ class BrokenReplies:
         (name, named), asked = bus.called(servo_id), lost.asked + lost.broken_off
         times = f"{counted(broken, 'time', 'times')} of {asked}"
         end = self._cut[index * IDS + servo_id] >= _ALONE * broken
-        cut = "; it is the last part of the status packet that all share" if end else ""
-        sentence = f"The replies of {named} come broken, {times}, and those of the others do not{cut}."
+        cut = " (the last block of the shared status packet)" if end else ""
+        sentence = f"The replies of {named} were broken {times}; those of other servos were intact{cut}."
         return (cause("broken_replies", name, sentence, share=broken / max(asked, 1)),)

@@ -76,7 +76,7 @@ class ForeignWrites:
             )
             if (name := shown[-1].name) in ends:
                 then = HURTS[EventCode(ends[name].code)]
-                parts.append(f"{items} to {name} (ID {servo_id}), which {then} then")
+                parts.append(f"{items} to {name} (ID {servo_id}) before it {then}")
             else:
                 by_items.setdefault(" and ".join(last), []).append((servo_id, items))
         for names, each in by_items.items():

@@ -287,11 +287,11 @@ class Occasions:
         if whole + even >= max(_FEWEST, (whole + sum(left)) / 2):
             heads = [servo for servo, one in losses.items() if one.broken_off]
             open_ = len(heads) == 1 and not any(times[one] for one in times if one not in {*named, *heads})
-            chain = f", of a chain that begins with {bus.called(heads[0])[0]}" if open_ else ""
+            chain = f" in a chain that starts with {bus.called(heads[0])[0]}" if open_ else ""
             parts = [f"{counted(whole, 'time', 'times')} no servo answered{chain}"] if whole else []
             if sum(left):
-                each = "its only servo" if len(times) == 1 else "single servos, evenly,"
-                parts.append(f"{counted(sum(left), 'time', 'times')} {each} did not")
+                each = "its only servo did not" if len(times) == 1 else "single servos did not, spread evenly"
+                parts.append(f"{counted(sum(left), 'time', 'times')} {each}")
             asked = sum(one.asked for one in losses.values())
             sentence = f"Bus {bus.name} lost replies: {'; '.join(parts)}."
             yield cause("lossy_line", bus.name, sentence, share=(whole + sum(left)) / max(asked, 1))
@@ -320,7 +320,7 @@ class Occasions:
         name, named = bus.called(servo)
         mine = losses.get(servo, ServoLosses(0, 0))
         where = self._where(base + servo)
-        silent = f", and {mine.broken_off} chains of which it is the first" if mine.broken_off else ""
+        silent = f", and {mine.broken_off} whole chains as first servo" if mine.broken_off else ""
         sentence = f"{named} lost {mine.lost} of {mine.asked} replies{silent}, in "
         sentence += f"{counted(times, 'episode', 'episodes')}{where}; "
         sentence += "other servos of its bus answered at these times."
@@ -341,7 +341,7 @@ class Occasions:
             if (part := narrowest(time_ns, begun, open_above=quantity != ANGLE)) is not None:
                 low, high, inside, share = part
                 text = self._states.range_text(joint, quantity, low, high)
-                found.append((share, f", {inside} of them {text}, where it was for {share:.0%} of the time"))
+                found.append((share, f", {inside} of them {text} ({share:.0%} of the time)"))
         return min(found, default=(0.0, ""))[1]
 
 

@@ -85,9 +85,7 @@ class OtherHosts:
         """Report another host on a bus, or an adapter that echoed some of this run's instructions."""
         echoes, asked = self._echoes[index], self._asked[index]
         if _FEWEST <= echoes < _ALL * asked:
-            sentence = (
-                f"Instructions come back on bus {bus.name}: its adapter echoed {echoes} of {asked} own ones."
-            )
+            sentence = f"The adapter of bus {bus.name} echoed {echoes} of {asked} instructions of this run."
             return (cause("another_host", bus.name, sentence, share=1.5),)
         values, counts = self._of(index)
         total = int(counts.sum())
@@ -104,9 +102,9 @@ class OtherHosts:
             kinds.append("others")
         wrote = f"; it wrote {written}" if written else ""
         sentence = (
-            f"Another host sends on bus {bus.name}: {counted(total, 'instruction', 'instructions')} that "
+            f"Another host sends on bus {bus.name}: {counted(total, 'instruction', 'instructions')} "
+            f"not from this run ({', '.join(kinds)}){wrote}."
         )
-        sentence += f"this run did not send ({', '.join(kinds)}){wrote}."
         share = _FAILED if failed else 1.0 if self.explains(index) else 0.0
         share = max(share, SPOILS if "goal_" in written else 0.0)
         return (cause("another_host", bus.name, sentence, share=share),)
@@ -116,9 +114,9 @@ class OtherHosts:
         ids, counts = self._unasked.counts_of(index)
         if (total := int(counts.sum())) >= _FEWEST_UNASKED:
             sentence = (
-                f"Another host uses bus {bus.name}, or its adapter: {total} replies came that this run did "
+                f"Another host uses bus {bus.name}, or its adapter: {total} unrequested replies "
+                f"(of {_ids(ids.tolist())})."
             )
-            sentence += f"not ask for (of {_ids(ids.tolist())})."
             yield cause("another_host", bus.name, sentence, share=SPOILS)
 
 

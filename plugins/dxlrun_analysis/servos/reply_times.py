@@ -169,7 +169,7 @@ class ReplyTimes:
             return
         late_us = median(*self._late(index, of_servos))
         what, fix = late_replies(bus.name, bus.port, late_us * 1e3, float(bus.latency_ns))
-        after = f", {given_up} of them after they were given up" if given_up else ""
+        after = f", {given_up} of them after the timeout" if given_up else ""
         sentence = f"{what[0].upper()}{what[1:]}: {share:.0%} of its exchanges{after}."
         yield cause("late_replies", bus.name, sentence, f"{fix}." if fix else "", share)
 
@@ -247,9 +247,9 @@ def _slow_servos(
             name, named = bus.called(servo_id)
             latest = max(int(kinds[kind][0][-1]) for kind in shared) / 1e3
             seen = (
-                f"{named} answers late now and then: {mine} of {asked} times, by up to {latest:.1f} ms; the "
+                f"{named} sometimes answers late: {mine} of {asked} times, by up to {latest:.1f} ms; other "
+                f"servos of its bus: {counted(theirs, 'time', 'times')}."
             )
-            seen += f"others of its bus {counted(theirs, 'time', 'times')}."
             yield cause("slow_servo", name, seen, share=mine / asked)
 
 
@@ -273,9 +273,10 @@ def _late_servo(bus: LoggedBus, servo_id: int, own: _Values, usual_us: float) ->
     if steady and delay_us - planned_us < _ODD_US:
         return  # The others answer sooner than planned
     name, named = bus.called(servo_id)
-    seen, command = f"{named} answers {median(*own) - usual_us:.0f} us later than the others of its bus", ""
+    command = ""
+    seen = f"{named} answers {median(*own) - usual_us:.0f} us later than the other servos of its bus"
     if steady and delay_us <= _LONGEST_DELAY_US + _STEADY_US:
-        seen += f", always: its Return Delay Time is {delay_us:.0f} us, and {planned_us:g} us were planned"
+        seen += f"; its Return Delay Time is {delay_us:.0f} us instead of {planned_us:g} us"
         command = f"`dxlrun servo {bus.port or 'PORT'} {servo_id} set return_delay_time {planned_us / 2:.0f}`"
         command += " corrects it."
     yield cause("slow_servo", name, f"{seen}.", command)

@@ -74,12 +74,12 @@ def test_machine_that_made_most_of_the_long_cycles_is_named(cycles: int, named: 
     ]
     assert len(machine) == named
     assert all("steal by the host took 70.00 ms of 100.00 ms" in one for one in machine)
-    assert all("the processor was hot and slow for 4 seconds" in one for one in machine)
+    assert all("heat throttled the processor for 4 seconds" in one for one in machine)
 
 
 def test_the_table_has_the_causes_and_their_shares() -> None:
     table = causes_table(Causes(5, 10, 100_000_000, (cause("controller", "left_arm"), OTHER)))
-    assert table.title == "Causes: 5 cycles woke late, 10 cycles took too long, 100.00 ms together"
+    assert table.title == "Causes: 5 cycles woke late, 10 cycles took too long; excess 100.00 ms"
     assert [cell.text for cell in table.rows[0]] == [
         "controller",
         "left_arm",

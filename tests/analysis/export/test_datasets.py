@@ -143,8 +143,8 @@ def test_a_data_set_is_the_same_however_the_log_is_sliced(made: Callable[..., Pa
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        ({"period_ns": 16_000_000}, "its rate is 62.5 Hz, and a LeRobot data set has a whole number"),
-        ({"shift_ns": 100_000_000}, "its rate was changed or it was paused in the run"),
+        ({"period_ns": 16_000_000}, "needs a whole number of frames per second, not a rate of 62.5 Hz"),
+        ({"shift_ns": 100_000_000}, "needs a constant rate, but the rate was changed, or the run was paused"),
     ],
 )
 def test_a_rate_that_a_data_set_cannot_have_is_refused(
@@ -160,7 +160,7 @@ def test_a_log_without_goals_has_no_frames(made: Callable[..., Path], tmp_path: 
     log = made((0, (0.1, 1.0), (NAN, NAN), (NAN, NAN)))
     code, _, (error,) = export(log, tmp_path / "set", "--format", "lerobot")
     assert (code, list(tmp_path.iterdir())) == (2, [log])
-    assert "so no frames" in error
+    assert "no frames: every cycle lacks" in error
 
 
 def foreign(log: Path, made: Path, topic: str) -> Path:

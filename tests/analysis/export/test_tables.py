@@ -148,8 +148,8 @@ def test_csv_of_another_topic(run: Path, tmp_path: Path, export: Export) -> None
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (("--format", "csv", "--topic", "/goal"), "it has no records of /goal; did you mean /goals?"),
-        (("--format", "parquet", "--topic", "/goals"), "--topic is for csv, and parquet has all topics"),
+        (("--format", "csv", "--topic", "/goal"), "no records of /goal; did you mean /goals?"),
+        (("--format", "parquet", "--topic", "/goals"), "--topic is only for csv, parquet has all topics"),
     ],
 )
 def test_a_wrong_topic_is_one_sentence_and_leaves_nothing(

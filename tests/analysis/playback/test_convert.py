@@ -139,12 +139,12 @@ def _only(line: str, joint: str, *, speed: bool) -> str:
     [
         (["a.mcap"], "a motion file is YAML, so its name ends in .yaml, not as a.mcap does"),
         (["none/a.yaml"], "there is no directory none"),
-        (["a.yaml", "--joint", "pan"], "both moves tilt too, and a motion file needs all its joints"),
+        (["a.yaml", "--joint", "pan"], "a motion file needs all joints of both; convert tilt too"),
         (
             ["a.yaml", "--joint", "pan", "--map", "pan=arm"],
-            "no controller that was active at its start takes",
+            "no controller active at the start plays motions of",
         ),
-        (["a.yaml", "--from", "70"], "there is no motion between --from and --to"),
+        (["a.yaml", "--from", "70"], "no motion between --from and --to"),
         (["a.yaml", "--controller", "1: [", "--joint", "pan"], "a.yaml:"),
     ],
 )

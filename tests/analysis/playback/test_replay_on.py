@@ -123,17 +123,17 @@ def test_a_speed_that_is_slow_enough_is_named(swing: Path, place: Path, dxlrun: 
     [
         (["--speed", "20"], "--speed 20: give a factor from 0.01 to 10"),
         (["--speed", "nan"], "--speed nan: give a factor"),
-        (["--from", "-1"], "--from -1: give seconds since the recording's beginning"),
+        (["--from", "-1"], "--from -1: give seconds since the start of the recording"),
         (["--from", "3", "--to", "2"], "--from 3 is not before --to 2"),
         (
             ["--from", "100"],
-            "there is no motion between --from and --to: all joints have positions from 0.000 s",
+            "no motion between --from and --to; choose times from 0.000 s",
         ),
         (["--map", "pan"], "--map pan: write RECORDED=JOINT"),
-        (["--map", "pan=tilt"], "--map leads several recorded joints to tilt"),
+        (["--map", "pan=tilt"], "--map gives several recorded joints the name tilt"),
         (["--map", "pin=tilt"], "--map pin: the recording has no joint pin; did you mean pan?"),
         (["--joint", "pin"], "--joint pin: the recording has no joint pin; did you mean pan?"),
-        (["--map", "pan=", "--map", "tilt="], "no joint is left to be played"),
+        (["--map", "pan=", "--map", "tilt="], "no joint is left to play"),
         (["--tolerance", "x"], "--tolerance x"),
         (["--tolerance", "20deg"], "--tolerance 20deg: give an angle above 0 and up to 10 deg"),
         (["--topic", "/x"], "--topic /x: "),
@@ -264,9 +264,7 @@ def test_a_jump_is_refused_however_short_the_motion_is(seconds: float) -> None:
 def test_a_long_motion_has_fewer_rows_and_one_that_is_too_long_is_refused() -> None:
     still = np.zeros(2000)
     assert rows(still, 8000.0).period_s == pytest.approx(0.02)
-    with pytest.raises(
-        InputError, match="11000 s of 1 joints are longer than can be played at once, 10000 s"
-    ):
+    with pytest.raises(InputError, match="11000 s of 1 joints are too long to play at once, at most 10000 s"):
         rows(still, 11000.0)
 
 

@@ -240,7 +240,7 @@ def test_other_references_than_those_of_the_log_are_refused(
     with pytest.raises(InputError, match="base: the controller would export other references"):
         replay_log(story("a restart"), [Setting.parse("base.exports=[position]")])
     other = plan(lambda content: content["loop"]["controllers"][1].update(reference=["position"]))
-    with pytest.raises(LogError, match="the plan in the log has other references than its cycles"):
+    with pytest.raises(LogError, match="the log is damaged: plan and cycles differ in references"):
         replay_log(changed(story("a restart"), other))
 
 

@@ -58,8 +58,8 @@ def test_remarks_go_to_stderr(
         "first: cycle 2, 0.040 s, controller states: recorded not active, replayed active",
     ]
     version, gap = said.err.splitlines()
-    assert version.startswith("pair: numpy was 1.0 in the run and is ")
-    assert gap.startswith("pair: the log misses a command that cycle 10 took")
+    assert version.startswith("pair: numpy has version 1.0 in the run and ")
+    assert gap.startswith("pair: the log lacks a command of cycle 10")
 
 
 @pytest.mark.parametrize(

@@ -118,7 +118,7 @@ def test_a_parameter_that_ends_the_replay_early(pair_log: Path) -> None:
         ("all_inputs.gian=1", "all_inputs has an unknown key 'gian'; did you mean gain?"),
         ("all_inputs.gain=much", "all_inputs.gain is the text 'much', but must be a number"),
         ("all_inputs.gain.low=1", "all_inputs.gain "),
-        ("all_inputs.joints.low=1", "joints has no parts"),
+        ("all_inputs.joints.low=1", "joints is not a mapping"),
         ("all_inputs.joints=[tail]", "claims joint tail, which is not defined"),
         ("all_inputs.joints=[nod, nod]", "names joint nod twice"),
         ("all_inputs.gain=[", "is not YAML"),
@@ -198,5 +198,5 @@ def test_a_file_outside_of_the_robots_directory_is_not_written(
 
 def test_a_plan_that_the_file_no_longer_gives(pair_log: Path, changed: Changed) -> None:
     log = changed(pair_log, plan(lambda content: content["loop"]["joints"][1].update(upper=0.5)))
-    with pytest.raises(InputError, match="no longer gives the plan that was run"):
+    with pytest.raises(InputError, match="no longer compiles to the plan of the run"):
         replay_log(log, (), {"speed": "5 rad/s"})

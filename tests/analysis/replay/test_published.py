@@ -107,7 +107,7 @@ def test_messages_that_the_recorder_lost_are_a_remark(pair_log: Path, run: Calla
 
     report = replay_log(run(before))
     assert report.same
-    assert "the log misses 4 messages of topics" in report.remarks
+    assert "the log lacks 4 messages of topics" in report.remarks
 
 
 def test_a_log_without_the_topic_is_replayed_without_it(pair_log: Path, changed: Changed) -> None:

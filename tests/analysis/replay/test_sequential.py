@@ -66,7 +66,7 @@ def test_its_analysis_finds_one_rate_and_every_period(log: Path) -> None:
         "delays add up" in cell.text for table in facts(read, report) for row in table.rows for cell in row
     )
     assert report.verdict.good
-    sentence = "Cycles followed each other, not the clock: 320 periods of 320 Hz took 1."
+    sentence = "The loop ran sequentially, not by the clock: 320 periods of 320 Hz took 1."
     assert any(one.startswith(sentence) for one in report.verdict.sentences)
     assert judge_run(totals_of(log)).sentences[1] == report.verdict.sentences[1]
     assert report.totals.periods.rates_hz == (320.0,)

@@ -285,11 +285,19 @@ def test_of_several_controllers_of_a_joint_the_active_one_is_named(
         (
             "rates",
             command("rate", data=rate(50).data),
-            "a change of the rate in the log is not the one that was made",
+            "in the replay: the log is damaged, or",
         ),
         ("rates", command("rate", kind="resume"), "contradict"),
-        ("a pause in a motion", command("pause", t_ns=77), r"a command \(pause\) that cycle .* has not its"),
-        ("a pause in a motion", command("trajectory", t_ns=77), r"\(trajectory\) that cycle .* has not its"),
+        (
+            "a pause in a motion",
+            command("pause", t_ns=77),
+            r"a command \(pause\) and its cycle .* have different",
+        ),
+        (
+            "a pause in a motion",
+            command("trajectory", t_ns=77),
+            r"\(trajectory\) and its cycle .* have different",
+        ),
     ],
 )
 def test_commands_that_cannot_be_are_damage(
@@ -306,12 +314,12 @@ def test_nothing_is_compared_behind_a_lost_command_for_the_loop_or_cycles_around
     report = replay_log(lost)
     assert (report.compared, report.different) == (30, 0)
     assert report.stopped.startswith(
-        "the log misses a command that cycle 30 took (1 record of loop/commands was overwritten or damaged "
+        "the log lacks a command of cycle 30 (1 record of loop/commands was overwritten or damaged "
         "before the recorder read it)"
     )
     report = replay_log(changed(tell("rates"), without(*range(18, 24))))  # the rate changes in cycle 20
     assert (report.compared, report.different) == (18, 0)
-    assert report.stopped.startswith("the log misses cycles between 18 and 23")
+    assert report.stopped.startswith("the log lacks cycles between 18 and 23")
 
 
 def test_what_is_refused_only_in_the_replay_is_reported(
@@ -335,7 +343,7 @@ def test_a_policy_of_which_the_log_has_lost_the_beginning(
     assert begun is not None
     report = replay_log(changed(log, lambda read: replace(read, commands=read.commands[:-1])))
     assert (report.compared, report.different) == (begun.cycle, 0)
-    assert report.stopped == f"the log misses in which cycle a policy began after cycle {begun.cycle - 1}"
+    assert report.stopped == f"the log lacks the start of a policy after cycle {begun.cycle - 1}"
 
 
 def test_a_bus_that_is_gone_before_the_policy(steer: Callable[..., Path]) -> None:

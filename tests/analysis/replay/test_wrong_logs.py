@@ -27,16 +27,16 @@ def test_nothing_is_compared_behind_a_gap(pair_log: Path, changed: Changed) -> N
     report = replay_log(changed(pair_log, without(*range(20, 25)), gaps=[("loop/cycles", 5)]))
     assert (report.cycles, report.compared, report.same) == (45, 20, True)
     assert report.stopped == (
-        "the log misses cycles between 20 and 24 (5 records of loop/cycles were overwritten or damaged "
-        "before the recorder read them); what the controllers knew after that is lost, so from cycle 25 on "
-        "nothing is compared"
+        "the log lacks cycles between 20 and 24 (5 records of loop/cycles were overwritten or damaged "
+        "before the recorder read them); the state of the controllers is unknown from cycle 25 on, so "
+        "the comparison ends"
     )
 
 
 def test_nothing_is_compared_behind_a_lost_command(pair_log: Path, changed: Changed) -> None:
     report = replay_log(changed(pair_log, no_commands()))
     assert (report.compared, report.same) == (10, True)
-    assert report.stopped.startswith("the log misses a command that cycle 10 took")
+    assert report.stopped.startswith("the log lacks a command of cycle 10")
 
 
 def of_controller(name: str, **other: object) -> Change:
@@ -49,16 +49,16 @@ def of_controller(name: str, **other: object) -> Change:
     return plan(edit)
 
 
-NO_PLAN = "the plan in the log is not one of this dxlrun"
-BEGINNING = "needs the run's beginning, and this log "
+NO_PLAN = "this dxlrun cannot read the plan in the log"
+BEGINNING = "needs the start of the run, but this log "
 REFUSED: dict[str, tuple[Change, str]] = {
-    "no first cycles": (only(slice(3, None)), f"{BEGINNING}begins with cycle 3; of a log in parts"),
+    "no first cycles": (only(slice(3, None)), f"{BEGINNING}begins with cycle 3; give the directory with all"),
     "no activation": (lambda log: replace(log, activation=None), f"{BEGINNING}has no /activation"),
-    "no cycles": (only(slice(0)), "there is nothing to replay"),
+    "no cycles": (only(slice(0)), "nothing to replay: "),
     "another contract": (
         versions(contract="7", dxlrun="9.1"),
-        "the run's controllers were made for contract 7, this dxlrun has contract 4: "
-        "replay it with the dxlrun that made it, version 9.1",
+        "the controllers of the run have contract 7, this dxlrun has contract 4; "
+        "replay the log with dxlrun version 9.1",
     ),
     "no plan": (plan(None), "no attachment plan.json"),
     "a plan that is none": (plan(b'{"robot": 5}'), NO_PLAN),
@@ -67,27 +67,30 @@ REFUSED: dict[str, tuple[Change, str]] = {
         NO_PLAN,
     ),
     "a plan that is too deep": (plan(b'{"x": ' + b"[" * 200_000), NO_PLAN),
-    "other joints": (plan(lambda content: content["loop"]["joints"].pop()), "other joints"),
+    "other joints": (
+        plan(lambda content: content["loop"]["joints"].pop()),
+        "plan and cycles differ in joints",
+    ),
     "other controllers": (
         plan(lambda content: content["loop"]["controllers"].reverse()),
-        "other controllers",
+        "plan and cycles differ in controllers",
     ),
     "no rate divider": (
         of_controller("head", every=0),
-        "there is no rate divider 0, as controller head has it in the plan",
+        "controller head of the plan has the rate divider 0",
     ),
     "no such joint": (
         of_controller("head", joints=["neck"]),
-        "there is no joint neck, as controller head has it in the plan",
+        "controller head of the plan has the unknown joint neck",
     ),
     "no such command": (
         plan(lambda content: content["loop"]["commands"].clear()),
-        "cycle 10 took a command that the plan in the log has not",
+        "the plan in the log lacks a command of cycle 10",
     ),
     "a deadline": (add("scheduled_ns", 30, 10**12), "contradict its number"),
     "a wake-up": (add("woken_ns", 30, -(10**12)), "contradict its number"),
     "a number": (add("cycle", 30, 10**12), "contradict its number"),
-    "a period": (add("period_ns", 30, 1), "cycle 30 was given a period of 20000001 ns"),
+    "a period": (add("period_ns", 30, 1), "cycle 30 had a period of 20000001 ns"),
 }
 
 
@@ -112,8 +115,7 @@ def test_a_missing_plug_in_and_parameters_that_the_installed_one_refuses(
 ) -> None:
     path = changed(pair_log, of_controller("all_inputs", type="gone"))
     assert refused(path, PlugInError) == (
-        f"{path}: no plug-in offers the type gone of controller all_inputs; the run had it from "
-        "all-inputs 1.0: install that"
+        f"{path}: no plug-in offers the type gone of controller all_inputs; install all-inputs 1.0"
     )
     parameters = '{"joints": ["tilt", "nod"], "gian": 1}'
     path = changed(pair_log, of_controller("all_inputs", parameters=parameters))
@@ -125,7 +127,7 @@ def test_a_missing_plug_in_and_parameters_that_the_installed_one_refuses(
 def test_other_versions_are_named(pair_log: Path, changed: Changed) -> None:
     older = plan_text((b"all-inputs 1.0", b"all-inputs 0.9"))
     numpy, plugin = replay_log(changed(pair_log, versions(numpy="1.0"), older)).remarks
-    assert numpy == f"numpy was 1.0 in the run and is {np.__version__} in the replay"
+    assert numpy == f"numpy has version 1.0 in the run and {np.__version__} in the replay"
     assert plugin == (
         "the controller type all_inputs came from all-inputs 0.9 in the run and comes from all-inputs 1.0 "
         "in the replay"

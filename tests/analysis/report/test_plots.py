@@ -161,7 +161,7 @@ def test_the_distribution_of_the_wake_ups_counts_each(logs: dict[int, Log]) -> N
     assert statistics is not None
     first, second, third = latency_plots(canvas_of(run), run, statistics)
     assert first.model.y_scale.__class__.__name__ == "LogScale"
-    _, y = lines(first)["woken after the deadline"]
+    _, y = lines(first)["delay after the deadline"]
     ((data, _),) = [one for one in glyphs(first, "Line") if str(one[1].y).startswith("high")]
     assert np.nanmax(np.asarray(list(data.values())[1:])) > 0
     assert np.nanmin(y) == np.float32(late.min())

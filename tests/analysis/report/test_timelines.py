@@ -59,7 +59,7 @@ def labels(plot: Plot) -> list[str]:
 
 def test_a_worst_cycle_is_drawn_with_its_steps_its_packets_and_the_plan() -> None:
     (plot,) = worst_plots(Canvas(0, 0, 10**9), [WORST])
-    assert plot.title.startswith("Cycle 7, 0.140 s, 29.00 ms beyond the plan, 1 period skipped after it")
+    assert plot.title.startswith("Cycle 7, 0.140 s, 29.00 ms beyond the plan, then 1 period skipped")
     assert plot.title.endswith("late reply of servo 21 (head) 27.60 ms")
     found = drawn(plot)
     steps = {

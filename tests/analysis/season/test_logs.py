@@ -271,14 +271,14 @@ def test_a_wrong_question_is_one_sentence_and_reads_or_writes_nothing(
 @pytest.mark.parametrize(
     ("kind", "sentence"),
     [
-        ("missing", "there is no directory"),
+        ("missing", "not found; give the directory of logs"),
         ("file", "`dxlrun analyze`"),
-        ("empty", "there are no logs"),
+        ("empty", "no logs (.mcap) found"),
         (
             "no duckdb",
             "duckdb and pyarrow, which are not installed; `pip install 'dxlrun[logs]'` installs them",
         ),
-        ("no cache", "XDG_CACHE_HOME names another place"),
+        ("no cache", "set XDG_CACHE_HOME to another directory"),
     ],
 )
 def test_what_cannot_be_is_one_sentence(  # noqa: PLR0917  fixtures
@@ -353,7 +353,7 @@ def test_a_process_that_ends_costs_its_own_log_only(
     for name in NAMES[1:]:
         (season / name).unlink()
     found = rows(dxlrun("logs", season, "--json"))
-    reason = "the process that read it ended: it crashed, or had too little memory"
+    reason = "the process reading the log crashed or ran out of memory"
     assert {name: row["unreadable"] for name, row in found.items()} == {
         "dies.mcap": reason,
         "first.mcap": None,

@@ -157,7 +157,7 @@ def test_what_a_robot_writes_still_waits_and_no_other_run_is_written_over(
     found = {"uploaded": ["one.mcap"], "there": ["parts"], "others": ["may/second.mcap"]}
     assert told(dxlrun, logs, url, code=1) == found
     assert (there / "may/second.mcap").read_bytes() == before
-    assert "another run named may/second.mcap" in dxlrun("upload", logs, url).errors[0]
+    assert "a different run named may/second.mcap" in dxlrun("upload", logs, url).errors[0]
 
     (there / "one.mcap.run.json").write_text('{"cycles": "many"}')
     assert rows(dxlrun, url)[0][1]["unreadable"] == stores.DAMAGED
@@ -192,11 +192,11 @@ def test_a_log_that_grows_while_it_is_copied_has_no_row(
 @pytest.mark.parametrize(
     ("words", "code", "sentence"),
     [
-        (("logs", "gopher://hole"), 2, "no such store; write s3://BUCKET/PREFIX"),
+        (("logs", "gopher://hole"), 2, "unknown kind of store; write s3://BUCKET/PREFIX"),
         (("logs", "file:///nowhere/at/all"), 2, "`dxlrun upload DIRECTORY file:///nowhere/at/all`"),
-        (("upload", "nowhere", "file:///tmp/x"), 2, "there is no directory nowhere"),
+        (("upload", "nowhere", "file:///tmp/x"), 2, "directory nowhere not found"),
         (("analyze", "file:///nowhere.mcap"), 1, "/nowhere.mcap"),
-        (("upload", "LOGS", "file://"), 2, "it names no bucket or directory"),
+        (("upload", "LOGS", "file://"), 2, "bucket or directory is missing"),
     ],
 )
 def test_what_is_no_store_is_one_sentence(
