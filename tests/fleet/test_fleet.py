@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import os
 import pty
+import random
 import re
 import shlex
 import signal
@@ -23,8 +24,9 @@ import pytest
 from rich.console import Console
 from tests.kit.answers import result_of
 from tests.kit.awaited import DEADLINE_S, until
+from tests.kit.campaigns import campaign
 from tests.kit.commands import Dxlrun
-from tests.kit.fuzzed_http import FRAMES, Said, children, process_of, stands
+from tests.kit.fuzzed_http import Said, check_port_survives_fuzzing, children, process_of
 from tests.kit.pages import page_text
 
 from dxlrun.channels.answers import Code
@@ -245,19 +247,25 @@ def test_an_agent_asks_for_a_certificate_with_the_role_admin(
     assert not list(lab.parent.glob("*.out"))
 
 
-@pytest.mark.campaign
-@pytest.mark.timeout(600 if FRAMES <= 1000 else 0)
-def test_of_fuzzed_requests_without_the_role_admin_an_agent_starts_nothing(
-    lab: Path, agent: subprocess.Popen[bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@campaign(ci=300, night=100_000, release=1_000_000)
+@pytest.mark.timeout(600)
+def test_agent_starts_nothing_for_fuzzed_requests_without_the_role_admin(
+    lab: Path,
+    agent: subprocess.Popen[bytes],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    *,
+    amount: float,
+    chance: random.Random,
 ) -> None:
     authority.issue("bert", Role.COMMAND, 30, tmp_path / "other" / "dxlrun" / "keys")
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "other"))
     address = read_fleet(lab).agents["lab3"].address
     names = ("joint", "joint/", "../joint", "joint?robot=joint", "hung", "%6Aoint", "")
     seeds = [Said(method, START + name, b"x") for name in names for method in ("POST", "GET", "DELETE")]
-    stands(
-        NetworkLink(address, "")._connected, partial(socket.create_connection, address[1:]), seeds, agent.pid
-    )
+    reach = partial(socket.create_connection, address[1:])
+    connect = NetworkLink(address, "")._connected
+    check_port_survives_fuzzing(connect, reach, seeds, agent.pid, frames=int(amount), draw=chance)
     assert not list(lab.parent.glob("*.out"))
 
 

@@ -87,9 +87,9 @@ def connected(url: str) -> socket.socket:
     return end
 
 
-def fuzz(url: str, count: int, seed: int) -> int:
+def fuzz(url: str, count: int, draw: random.Random) -> int:
     """Send so many frames, on as many connections as that takes; return how many those were."""
-    draw, sent, connections = random.Random(seed), 0, 0
+    sent, connections = 0, 0
     while sent < count:
         end = connected(url)
         connections += 1
@@ -111,9 +111,9 @@ def _drain(end: socket.socket) -> None:
             pass
 
 
-def knock(url: str, count: int, seed: int) -> None:
+def knock(url: str, count: int, draw: random.Random) -> None:
     """Connect and send what is no handshake, or one without the token."""
-    draw, found = random.Random(seed), urlsplit(url)
+    found = urlsplit(url)
     whole = f"GET /?token=x HTTP/1.1\r\nHost: {found.netloc}\r\nUpgrade: websocket\r\n\r\n".encode()
     for _ in range(count):
         with socket.create_connection((found.hostname, found.port), timeout=60) as end, suppress(OSError):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import random
 import re
 import signal
 import struct
@@ -18,6 +19,7 @@ from mcap.reader import make_reader
 from tests.foxglove import fuzz
 from tests.foxglove.foreign import ForeignViewer
 from tests.kit.awaited import DEADLINE_S, until
+from tests.kit.campaigns import campaign
 from tests.kit.pages import page_text
 from tests.kit.torso import JOINT, SERVO, TORQUE_ENABLE, Run
 from websockets.exceptions import ConnectionClosed
@@ -25,8 +27,6 @@ from websockets.exceptions import ConnectionClosed
 import dxlrun
 
 COMMANDS = re.findall(r"^    dxlrun (foxglove.*)$", page_text("foxglove.md"), re.MULTILINE)
-FRAMES = int(os.environ.get("DXLRUN_FOXGLOVE_FRAMES", "1000"))
-SEED = int(os.environ.get("DXLRUN_FOXGLOVE_SEED", "1"))
 PAGE = os.sysconf("SC_PAGE_SIZE")
 MAIN = "from dxlrun.cli import main; main()"
 ROBOT = "bioloid_torso_imu"
@@ -74,8 +74,10 @@ def started(run: Run) -> Iterator[list[Started]]:
         process.stdout.close()
 
 
-@pytest.mark.campaign
-def test_a_viewer_gets_the_logs_bytes_and_steers_only_with_control(run: Run, started: list[Started]) -> None:
+@campaign(ci=1000, night=100_000, release=1_000_000)
+def test_a_viewer_gets_the_logs_bytes_and_steers_only_with_control(
+    run: Run, started: list[Started], amount: float, chance: random.Random
+) -> None:
     looks, control = started
     with ForeignViewer(looks.url) as only_looks, ForeignViewer(control.url) as steers:
         assert (only_looks.first, steers.first) == ("serverInfo", "serverInfo")
@@ -86,7 +88,7 @@ def test_a_viewer_gets_the_logs_bytes_and_steers_only_with_control(run: Run, sta
         only_looks.until(lambda: only_looks.channels.keys() >= EVERY)
         only_looks.subscribe(*only_looks.channels)
         may_not_change(only_looks, steers)
-        nothing_comes_of_noise(looks)
+        check_noise_is_harmless(looks, int(amount), chance)
         assert not written(run, TORQUE_ENABLE, 0)
         changes_parameters(only_looks, steers)
         steers_the_robot(run, steers)
@@ -128,16 +130,18 @@ def may_not_change(only_looks: ForeignViewer, steers: ForeignViewer) -> None:
     assert "invalid frame" in only_looks.words("status")["message"]
 
 
-def nothing_comes_of_noise(looks: Started) -> None:
-    """Fuzzed frames, handshakes without the token, half-open connections: a viewer still gets in, memory
-    does not grow."""
-    fuzz.fuzz(looks.url, FRAMES // 10, SEED)
-    fuzz.knock(looks.url, FRAMES // 100, SEED)
+def check_noise_is_harmless(looks: Started, frames: int, draw: random.Random) -> None:
+    """Send fuzzed frames, handshakes without the token, and leave connections half open.
+
+    A viewer still gets in, and memory does not grow.
+    """
+    fuzz.fuzz(looks.url, frames // 10, draw)
+    fuzz.knock(looks.url, frames // 100, draw)
     before = looks.memory
-    fuzz.fuzz(looks.url, FRAMES, SEED + 1)
-    fuzz.knock(looks.url, FRAMES // 20, SEED + 1)
+    fuzz.fuzz(looks.url, frames, draw)
+    fuzz.knock(looks.url, frames // 20, draw)
     with ExitStack() as opened:
-        for one in fuzz.half_open(looks.url, FRAMES // 1000):
+        for one in fuzz.half_open(looks.url, frames // 1000):
             opened.enter_context(one)
         with ForeignViewer(looks.url) as viewer:
             viewer.words("serverInfo")

@@ -97,7 +97,7 @@ class Campaigns:
             if count_of(item, self._level) is not None:
                 self._rows.setdefault(item.nodeid.partition("[")[0], item)
                 if self._level is not Level.CI:
-                    item.add_marker(pytest.mark.timeout(0))
+                    item.add_marker(pytest.mark.timeout(0), append=False)
         without = [item for item in items if count_of(item, self._level) == 0]
         if without:
             config.hook.pytest_deselected(items=without)

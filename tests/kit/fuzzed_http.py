@@ -12,9 +12,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 Connect = Callable[[], socket.socket]
-FRAMES = int(os.environ.get("DXLRUN_NETWORK_FRAMES", "300"))
-SEED = int(os.environ.get("DXLRUN_NETWORK_SEED", "1"))
-HALF_OPEN = int(os.environ.get("DXLRUN_NETWORK_HALF_OPEN", "150"))
+HALF_OPEN = 150
+"""Connections that are left half open: more than twice as many as a port keeps."""
 BATCH, MOST_BATCHES = 20, 50
 """Requests that are sent together, and batches of a connection; noise ends it."""
 _STATUS = re.compile(rb"HTTP/1\.1 \d{3}")
@@ -68,9 +67,9 @@ def _mutant(said: Said, draw: random.Random) -> Said:
     return said._replace(path="/" + re.sub(r"[^!-~]", "%", path))
 
 
-def fuzz(connect: Connect, seeds: Sequence[Said], count: int, seed: int) -> Fuzzed:
+def fuzz(connect: Connect, seeds: Sequence[Said], count: int, draw: random.Random) -> Fuzzed:
     """Send so many frames, all answers of whole ones awaited, on as many connections as that takes."""
-    draw, sent, connections, answers = random.Random(seed), 0, 0, 0
+    sent, connections, answers = 0, 0, 0
     while sent < count:
         connections += 1
         with connect() as end, suppress(OSError):  # it was closed for what broke the protocol
@@ -96,12 +95,16 @@ def _answers(end: socket.socket, count: int) -> int:
     return found
 
 
-def stands(connect: Connect, reach: Connect, seeds: Sequence[Said], process: int) -> None:
-    """Fuzz a port, and leave connections half open that `reach` opens: it serves all the same, and the memory
-    of its process does not grow from what a tenth of it has made of it."""
+def check_port_survives_fuzzing(
+    connect: Connect, reach: Connect, seeds: Sequence[Said], process: int, *, frames: int, draw: random.Random
+) -> None:
+    """Fuzz a port, and leave connections half open that `reach` opens.
+
+    The port still serves, and the memory of its process does not grow after the first tenth of the frames.
+    """
     kept: list[float] = []
-    for count in (FRAMES // 10, FRAMES):
-        sent = fuzz(connect, seeds, count, SEED + len(kept))
+    for count in (frames // 10, frames):
+        sent = fuzz(connect, seeds, count, draw)
         with ExitStack() as opened:
             for number in range(HALF_OPEN):
                 end = opened.enter_context(reach())

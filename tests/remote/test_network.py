@@ -10,6 +10,7 @@ from datetime import timedelta
 from functools import partial
 
 import pytest
+from tests.kit.campaigns import campaign
 from tests.remote.conftest import STOP, Door
 
 from dxlrun.channels.answers import Code
@@ -24,8 +25,6 @@ from dxlrun.remote.requests.request_table import REQUESTS, Role
 from dxlrun.remote.sockets import Address
 
 authority = pytest.importorskip("dxlrun_fleet.authority", reason="needs the extra network")
-
-HALF_OPEN = int(os.environ.get("DXLRUN_NETWORK_HALF_OPEN", "150"))
 
 
 @pytest.fixture(scope="module")
@@ -255,11 +254,11 @@ def test_client_without_a_name_of_its_own_has_that_of_its_certificate(desk, chos
     assert desk.taken[-1].origin == "client anna"
 
 
-@pytest.mark.campaign
-def test_half_open_connections_keep_no_client_out_and_are_closed(net):
+@campaign(ci=150, night=300, release=1000)
+def test_half_open_connections_are_closed_and_lock_no_client_out(net, amount):
     def act():
         ends = []
-        for number in range(HALF_OPEN):
+        for number in range(int(amount)):
             end = socket.create_connection(net.address[1:])
             with suppress(ConnectionError):  # closed already, as one of too many
                 end.sendall(b"\x16\x03\x01"[: number % 4])
@@ -275,7 +274,7 @@ def test_half_open_connections_keep_no_client_out_and_are_closed(net):
     before = len(os.listdir("/proc/self/fd"))
     assert net.while_served(act) < before + MOST_UNPROVED + 30
     assert {command.kind for command in net.desk.taken} == {"stop"}
-    assert len(net.desk.taken) == HALF_OPEN // 50
+    assert len(net.desk.taken) == amount // 50
 
 
 def test_addresses(monkeypatch, tmp_path):

@@ -16,7 +16,8 @@ from pathlib import Path
 import pytest
 from tests.kit.answers import result_of
 from tests.kit.awaited import DEADLINE_S, until
-from tests.kit.fuzzed_http import FRAMES, Said, process_of, stands
+from tests.kit.campaigns import campaign
+from tests.kit.fuzzed_http import Said, check_port_survives_fuzzing, process_of
 from tests.kit.pages import page_text
 from tests.kit.torso import Run, copy_robots, settled, written
 from tests.kit.wire import commands, taken_apart
@@ -31,7 +32,7 @@ from dxlrun.remote.sockets import Address, SocketLink, sockets
 from dxlsim.bus.ledger import read_ledger
 
 authority = pytest.importorskip("dxlrun_fleet.authority", reason="needs the extra network")
-pytestmark = pytest.mark.timeout(600 if FRAMES <= 1000 else 0)
+pytestmark = pytest.mark.timeout(600)
 
 DXLRUN = Path(sys.executable).with_name("dxlrun")
 PAGE = page_text("network.md")
@@ -203,9 +204,12 @@ def described(computers):
                 assert ask(method.upper(), path.replace("{", "").replace("}", ""))[0] == 403, path
 
 
-@pytest.mark.campaign
-def test_of_fuzzed_requests_no_command_comes_and_no_memory_is_kept(tmp_path, monkeypatch):
-    """An observer by TLS asks for all that it may not; of this user's own socket no request that commands."""
+@campaign(ci=300, night=100_000, release=1_000_000)
+def test_fuzzed_requests_command_nothing_and_leak_no_memory(tmp_path, monkeypatch, amount, chance):
+    """An observer on TLS requests everything that is forbidden to it.
+
+    The seeds of this user's own socket have no request that commands.
+    """
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "settings"))
     with socket.create_server(("127.0.0.1", 0)) as free:
@@ -219,7 +223,8 @@ def test_of_fuzzed_requests_no_command_comes_and_no_memory_is_kept(tmp_path, mon
         with dxlrun.connect(address.name) as robot:
             before = settled(run.ledger, lambda: robot.info()["cycles"], 20)
         for link in (NetworkLink(address, ""), SocketLink(sockets()[address.name], "")):
-            stands(link._connected, partial(reached, link), seeds(link), gateway)
+            ways = link._connected, partial(reached, link)
+            check_port_survives_fuzzing(*ways, seeds(link), gateway, frames=int(amount), draw=chance)
             assert written(run.ledger) == before
         with dxlrun.connect(address.name) as robot:
             robot.stop()

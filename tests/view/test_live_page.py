@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import random
 import socket
 from collections.abc import Callable
 from functools import partial
@@ -11,7 +12,8 @@ from typing import Any, cast
 
 import pytest
 from tests.kit.awaited import until
-from tests.kit.fuzzed_http import Said, stands
+from tests.kit.campaigns import campaign
+from tests.kit.fuzzed_http import Said, check_port_survives_fuzzing
 from tests.kit.torso import GOAL_POSITION, JOINT, SERVO, TORQUE_ENABLE, Run, settled, written
 from tests.view.served import Served
 
@@ -130,9 +132,9 @@ def test_a_wrong_message_is_refused_with_a_sentence(live: LiveRobot, serve: Serv
         assert served.ask(path)[0] == 404, path
 
 
-@pytest.mark.campaign
+@campaign(ci=300, night=100_000, release=1_000_000)
 def test_fuzzed_clicks_without_the_token_or_from_elsewhere_move_nothing(
-    live: LiveRobot, serve: Serve, run: Run
+    live: LiveRobot, serve: Serve, run: Run, amount: float, chance: random.Random
 ) -> None:
     served = serve(live, control=True)
     with live.asking() as robot:
@@ -152,7 +154,7 @@ def test_fuzzed_clicks_without_the_token_or_from_elsewhere_move_nothing(
         for method, path in (("POST", "/act"), ("POST", "/look"), ("GET", "/urdf"), ("GET", "/mesh?name=x"))
     ]
     reach = partial(socket.create_connection, ("127.0.0.1", served.port))
-    stands(reach, reach, seeds, os.getpid())
+    check_port_survives_fuzzing(reach, reach, seeds, os.getpid(), frames=int(amount), draw=chance)
     assert written(run.ledger) == before
 
 
