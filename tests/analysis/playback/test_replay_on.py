@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import random
 import signal
 import threading
 from collections.abc import Callable, Mapping
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 from tests.kit.anew import put, written_anew
 from tests.kit.answers import result_of
+from tests.kit.campaigns import campaign
 
 from dxlrun import ROTARY
 from dxlrun.errors import InputError
@@ -26,7 +28,6 @@ from dxlrun_lab.commands import on_robot
 from dxlrun_lab.guided import virtual_rig
 
 Dxlrun = Callable[..., Any]
-REAL = int(os.environ.get("DXLRUN_PLAYBACKS", "0"))  # How many motions are interrupted in real time
 
 
 def played(words: Mapping[str, Any]) -> Log:
@@ -288,23 +289,34 @@ def test_a_state_that_is_not_valid_is_no_position(swing: Path, tmp_path: Path) -
 # Ended early
 
 
-@pytest.mark.campaign
-@pytest.mark.parametrize("number", range(1 + REAL))
-def test_ctrl_c_brings_the_joints_to_rest_and_ends_the_run(
-    swing: Path, place: Path, dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch, number: int
+@pytest.fixture(name="replay_until")
+def _replay_until(swing: Path, place: Path, dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch):
+    """Replay the motion on the robot, press Ctrl-C some seconds after its beginning, and judge the log."""
+
+    def replay_until(after_s: float, *words: object) -> None:
+        def interrupt(*_: object) -> None:
+            threading.Timer(after_s, os.kill, (os.getpid(), signal.SIGINT)).start()
+
+        monkeypatch.setattr(on_robot, "_show", interrupt)  # when the motion begins
+        done = dxlrun("replay", swing, "--on", "pair.yaml", *words)
+        assert done.code == 130, done
+        assert "pair: the motion ended early: aborted by Ctrl-C" in done.err
+        (path,) = place.glob("logs/*.mcap")
+        log = read_log(path)
+        assert log.complete
+        assert np.abs(np.diff(log.cycles["goal_position"][-10:], axis=0)).max() < 1e-3
+
+    return replay_until
+
+
+def test_ctrl_c_brings_the_joints_to_rest_and_ends_the_run(replay_until) -> None:
+    replay_until(0.67, "--speed", 0.01, "--virtual")
+
+
+@campaign(ci=0, night=5, release=20)
+def test_ctrl_c_in_real_time_brings_the_joints_to_rest(
+    replay_until, number: int, chance: random.Random
 ) -> None:
-    """The first on virtual time, the others in real time, each at another moment."""
-    virtual, after_s = number == 0, float(np.random.default_rng(number).uniform(0.1, 1.0))
-
-    def interrupt(*_: object) -> None:
-        threading.Timer(after_s, os.kill, (os.getpid(), signal.SIGINT)).start()
-
-    monkeypatch.setattr(on_robot, "_show", interrupt)  # when the motion begins
-    speed = 0.01 if virtual else 0.1
-    done = dxlrun("replay", swing, "--on", "pair.yaml", "--speed", speed, *["--virtual"] * virtual)
-    assert done.code == 130, done
-    assert "pair: the motion ended early: aborted by Ctrl-C" in done.err
-    (path,) = place.glob("logs/*.mcap")
-    log = read_log(path)
-    assert log.complete
-    assert np.abs(np.diff(log.cycles["goal_position"][-10:], axis=0)).max() < 1e-3
+    after_s = chance.uniform(0.1, 1.0)
+    print(f"Ctrl-C after {after_s} s")
+    replay_until(after_s, "--speed", 0.1)

@@ -1,11 +1,10 @@
 """A replay of chains has no difference, and names the reference that differs where there is one.
 
-CI tries 8 random runs; `DXLRUN_CHAIN_RUNS=500 pytest tests/analysis/replay/test_chains.py` tries more.
+CI tries 8 random runs; `pytest --campaign=release tests/analysis/replay/test_chains.py` tries more.
 """
 
 from __future__ import annotations
 
-import os
 import random
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -19,6 +18,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from tests.kit.anew import flip, plan
+from tests.kit.campaigns import campaign
 from tests.kit.stories import Asked, ask, differing, plugin_folder, replayed, send, silence, switch, tell
 
 from dxlrun.channels.commands import CommandMessage
@@ -28,7 +28,6 @@ from dxlrun.log.log_reader import read_log
 from dxlrun.testing import VirtualRobot
 from dxlrun_analysis.replay import Setting, replay_log
 
-RUNS = int(os.environ.get("DXLRUN_CHAIN_RUNS", "8"))
 ROBOT = """\
 name: chained
 buses:
@@ -294,14 +293,8 @@ def goal_writes(ledger: Sequence[Any]) -> Iterator[tuple[int, int]]:
                 yield entry.t_ns, data[place]
 
 
-@pytest.mark.campaign
-@settings(
-    max_examples=RUNS,
-    deadline=None,
-    derandomize=RUNS <= 100,
-    database=None,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
-)
+@campaign(ci=8, night=100, release=500)
+@settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(seed=st.integers(0, 10**9))
 def test_random_runs_of_chains(law: Path, tmp_path: Path, seed: int) -> None:
     """The replay has no difference; no joint has two commanders, by the ledger and by the masks."""

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tests.kit.anew import command, edited
+from tests.kit.campaigns import campaign
 from tests.kit.examples import as_parameters
 from tests.kit.stories import differing, replayed, silence
 
@@ -36,13 +37,12 @@ def motions_for(robot: Path) -> list[Path]:
     return []
 
 
-@pytest.mark.campaign
+@campaign(ci=4, night=15, release=60)
 @pytest.mark.parametrize("robot", as_parameters(sorted(ROBOTS.glob("*.yaml"))))
-def test_seconds_of_each_robot_or_as_many_cycles_as_one_of_100_hz_has(robot: Path, tmp_path: Path) -> None:
-    """`DXLRUN_REPLAY_S=60` makes it a minute, for the campaign before a release."""
-    longest = float(os.environ.get("DXLRUN_REPLAY_S", "4"))
+def test_replay_of_each_robot_has_no_difference(robot: Path, tmp_path: Path, amount: float) -> None:
+    """`amount` is the length in seconds, or as many cycles as a robot of 100 Hz has in them."""
     log = tmp_path / "run.mcap"
-    seconds = min(longest, 100 * longest * plan_of(robot).loop.period_ns * 1e-9)
+    seconds = min(amount, 100 * amount * plan_of(robot).loop.period_ns * 1e-9)
     simulated_robot(robot, play=motions_for(robot), duration_s=seconds, log=log).run()
     read = replayed(log)
     periods = len(read.cycles) + read.cycles["skipped"].sum()

@@ -1,11 +1,10 @@
 """A replay of a steered run has no difference: what clients asked, they ask of the same cycles again.
 
-CI tries 4 random runs; `DXLRUN_STEERED_RUNS=1000 pytest tests/analysis/replay/test_steered.py` tries more.
+CI tries 4 random runs; `pytest --campaign=release tests/analysis/replay/test_steered.py` tries more.
 """
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -18,6 +17,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from msgspec import structs
 from tests.kit.anew import Change, command, flip, no_commands, without
+from tests.kit.campaigns import campaign
 from tests.kit.stories import Asked, ask, differing, rate, replayed, send, silence, switch, torque
 from tests.kit.stories import tell as tell_story
 
@@ -237,12 +237,8 @@ COMMANDS = st.one_of(
 )
 
 
-@pytest.mark.campaign
-@settings(
-    max_examples=int(os.environ.get("DXLRUN_STEERED_RUNS", "4")),
-    deadline=None,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
-)
+@campaign(ci=4, night=100, release=1000)
+@settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.dictionaries(st.integers(0, 45), st.lists(COMMANDS, min_size=1, max_size=4), max_size=15))
 def test_any_sequence_of_commands(steer: Callable[..., Path], asked: dict[int, list[CommandMessage]]) -> None:
     replayed(steer({**asked, 60: [ask("stop")]}))  # a pause has no end

@@ -323,13 +323,15 @@ class Story:
     def read(self, servo_id: int, item: str) -> bytes:
         """Return a read of another host, of an item of the control table."""
         entry = self.item(item)
-        packet: bytes = self._wire().read(servo_id, entry.address, entry.size)
+        packet: bytes = self._wire().read_range(servo_id, entry.address, entry.size)
         return packet
 
     def write(self, servo_id: int, item: str, value: int) -> bytes:
         """Return a write of another host."""
         entry = self.item(item)
-        packet: bytes = self._wire().write(servo_id, entry.address, value.to_bytes(entry.size, "little"))
+        packet: bytes = self._wire().write_range(
+            servo_id, entry.address, value.to_bytes(entry.size, "little")
+        )
         return packet
 
     def sync_write(self, item: str, data: dict[int, int]) -> bytes:
