@@ -324,7 +324,7 @@ def test_the_tables_have_a_column_for_each_condition():
     assert rows["maximum"] == ["20.00 ms", "20.00 ms"]
     assert rows["mode"] == ["1 us", "1 us"]
     assert rows["later than 1 ms"] == ["50.000%", "50.000%"]
-    assert {row[0].text: row[1].text for row in second.rows}["mean, times that of c"] == "1 (1 to 1)"
+    assert {row[0].text: row[1].text for row in second.rows}["mean, relative to c"] == "1 (1 to 1)"
     assert len(remarks) == 1
 
 

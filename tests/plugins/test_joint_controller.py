@@ -117,7 +117,7 @@ def test_code_of_a_log_is_executed_only_on_request(written: Written) -> None:
     assert Path("ran").exists()
     assert trusted.remarks == ("wave.py has changed since the run; the replay ran the version in the log",)
     Path("wave.py").unlink()
-    with pytest.raises(InputError, match=r"wave\.py cannot be read, and the code in a log is not executed"):
+    with pytest.raises(InputError, match=r"wave\.py cannot be read; write --code"):
         replay_log(log)
     with pytest.raises(InputError, match=r"--code current: wave\.py cannot be read"):
         replay_log(log, code="current")

@@ -135,10 +135,7 @@ def conditions(compare: str | None, policy: Policy | None) -> tuple[Condition, .
     known = (*POLICIES, YARDSTICK)
     for number, name in enumerate(names):
         if name not in known:
-            raise InputError(
-                f"--compare: {name!r} is not a condition of a list like other,round_robin,c; "
-                f"{suggestion(name, known)}"
-            )
+            raise InputError(f"--compare: {name!r} is not a condition; {suggestion(name, known)}")
         if name in names[:number]:
             raise InputError(f"--compare: {name} is named twice; name each condition once")
     if names == [YARDSTICK]:
