@@ -172,7 +172,7 @@ WRONG_KEYS: Mapping[str, tuple[Keys, list[tuple[Keys, str]]]] = {
         ({"growth": 1.0}, "greater than 1"),
     ]),
     "imu_sensor_broadcaster": ({"sensor": "chip"}, [
-        ({"orientation": "sensor", "magnetometer": "compass"}, "are for orientation: madgwick"),
+        ({"orientation": "sensor", "magnetometer": "compass"}, "need orientation: madgwick"),
         ({"declination": "3 deg"}, "name a magnetometer"),
         ({"gain": -0.1}, "greater than or equal to 0"),
         ({"mounting": ["0 deg", "0 deg"]}, "at least 3 items"),
@@ -196,11 +196,11 @@ WRONG_KEYS: Mapping[str, tuple[Keys, list[tuple[Keys, str]]]] = {
         (player(w={"steps": []}), "at least 1 item"),
         (player(w=page(STEP | {"pose": {"c": "1 rad"}})), "c is not one of its joints"),
         (player(w=page(STEP | {"torque": {"c": 1.0}})), "c is not one of its joints"),
-        (player(w=page(next="x")), "there is no motion x; there are w"),
+        (player(w=page(next="x")), "motion x is not defined; the motions are w"),
         (player(w=page(next="x"), x=page(next="w")), "in a circle: w -> x -> w"),
         (player(w=page(STEP | {"time": "1 ms"})), "greater than or equal"),
         (player(w=page(STEP | {"interpolation": "bezier"})), "smooth"),
-        ({"start": "flap"}, "there is no motion flap"),
+        ({"start": "flap"}, "motion flap is not defined"),
     ]),
     "leader_follower": (LED, [
         ({"pairs": []}, "at least 1 item"),
@@ -216,11 +216,11 @@ WRONG_KEYS: Mapping[str, tuple[Keys, list[tuple[Keys, str]]]] = {
         ({"output_limit": {"c": 1.0}}, "c is not one of its joints"),
         ({"wrap": ["c"]}, "c is not one of its joints"),
         (VELOCITY | {"wrap": ["a"]}, "velocities do not wrap"),
-        (VELOCITY | OF_POSITION, "cannot be commanded as positions"),
+        (VELOCITY | OF_POSITION, "does not fit command_interface position"),
         ({"gains": {"p": "3 Nm"}}, "valid number"),
     ]),
     "sample_player": (TWO, [
-        ({"bounds": {"range": {"a": ["0.2 rad", "0.1 rad"]}}}, r"of a ends at 0\.1 rad, where it begins"),
+        ({"bounds": {"range": {"a": ["0.2 rad", "0.1 rad"]}}}, r"from 0\.2 rad to 0\.1 rad is empty"),
         ({"bounds": {"range": {"c": ["0.1 rad", "0.2 rad"]}}}, "c is not one of its joints"),
     ]),
     "sensor_broadcaster": ({"message": "Range"}, [

@@ -588,4 +588,4 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
             return f"joint {joint} is {unit.text(float(self._error[row]))} off its path"
         speeds = (self.context.states.velocity, self._desired.velocity, self._within.path_velocity)
         actual, desired, allowed = (unit.speed_text(float(of[row])) for of in speeds)
-        return f"joint {joint} moves at {actual} instead of {desired}; the tolerance is {allowed}"
+        return f"joint {joint} moves at {actual} instead of {desired} (tolerance {allowed})"

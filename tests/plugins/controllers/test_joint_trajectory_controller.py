@@ -221,7 +221,7 @@ def test_a_goal_has_path_tolerances_of_its_own():
 
 def test_a_tolerance_of_a_joint_that_is_not_moved_is_refused():
     for key in ("goal_tolerance", "path_tolerance"):
-        with pytest.raises(ValueError, match=f"{key} names b, which is not moved"):
+        with pytest.raises(ValueError, match=f"{key} names b, but the moved joints are a"):
             started(TWO).prepare("trajectory", points=one(1.3), joints=["a"], **{key: {"b": 0.1}})
 
 
@@ -613,7 +613,9 @@ def test_a_speed_off_the_path_is_named_with_the_desired_and_the_allowed_one():
     robot.send(0.0, "trajectory", path_tolerance={"a": {"velocity": 0.5}}, points=one(1.3))
     robot.states.velocity[:] = 0.2
     robot.update(0.1)
-    told = "after 0.100 s, joint a moves at 11.46 deg/s instead of 57.30 deg/s, 28.65 deg/s allowed, stopping"
+    told = (
+        "after 0.100 s, joint a moves at 11.46 deg/s instead of 57.30 deg/s (tolerance 28.65 deg/s), stopping"
+    )
     assert [end[1] for end in robot.goal.ended] == [told]
 
 

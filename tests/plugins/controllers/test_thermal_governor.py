@@ -113,9 +113,9 @@ def test_events_say_once_that_a_servo_is_hot_spent_and_cool() -> None:
             at_s += 0.02
     named = "b (ID 2 on bus main) "
     assert robot.warned == [
-        f"{named}is at 69.9 deg C: from 65 on it gets less torque",
-        f"{named}is at 75.0 deg C: from 75 on it gets no torque",
-        f"{named}is at 65.0 deg C: from 65 on it gets less torque",
+        f"{named}is at 69.9 deg C (threshold 65): it gets less torque",
+        f"{named}is at 75.0 deg C (threshold 75): it gets no torque",
+        f"{named}is at 65.0 deg C (threshold 65): it gets less torque",
     ]
     assert [text.partition("has cooled")[0] for text in robot.said] == [named] * 2
     assert ["below 75" in text for text in robot.said] == [True, False]
@@ -154,7 +154,7 @@ def test_what_fits_is_accepted(tmp_path: Path, change: tuple[str, str]) -> None:
         ((f", {PARTS}", ""), "j]", "needs the error for the full torque of j; write reach"),
         ((PARTS, f"{PARTS}, limit: 80"), "80", "has 80 deg C as limit of j, but the XM430-W350 cuts"),
         (("direction: 1", "direction: 1, registers: {temperature_limit: 60}"), "", ""),
-        ((PARTS, f"{PARTS}, limit: {{j: 95}}"), "{j: 95}", "beyond 80; write limit: 75 at most"),
+        ((PARTS, f"{PARTS}, limit: {{j: 95}}"), "{j: 95}", "beyond 80; write limit: 75 or less"),
         ((PARTS, f"{PARTS}, warn: 75"), "75", "warn of j at 75 deg C, not below its limit of 75"),
         ((PARTS, f"{PARTS}, limit: 60"), "60", "warn of j at 65 deg C, not below its limit of 60"),
         (("id: 1,", "servos: [{id: 1}, {id: 2}],"), "j]", "cannot limit the temperature of j: it has"),
@@ -184,8 +184,8 @@ def test_a_controller_that_is_loaded_or_replayed_otherwise_is_compared_with_the_
     preparation = Preparation({joint.name: joint for joint in loop.joints}, plugins, urdf=loop.urdf)
     entry = {"name": "more", "type": "thermal_governor", "joints": ["j"], "reach": "12 deg"}
     assert preparation.controller(entry, {}, 50.0).joints == ("j",)
-    with pytest.raises(RefusedRequest, match=r"more lets j become 90 deg C hot.*; write limit: 75 at most"):
+    with pytest.raises(RefusedRequest, match=r"more has 90 deg C as limit of j.*; write limit: 75 or less"):
         preparation.controller(entry | {"limit": 90}, {}, 50.0)
     with_settings(loop, [Setting("hot", ("limit",), 70)], plugins)
-    with pytest.raises(InputError, match="--set hot: hot lets j become 90 deg C hot"):
+    with pytest.raises(InputError, match="--set hot: hot has 90 deg C as limit of j"):
         with_settings(loop, [Setting("hot", ("limit",), 90)], plugins)
