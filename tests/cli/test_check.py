@@ -173,7 +173,7 @@ def test_too_fast_a_loop_names_the_highest_rate(dxlrun, torso):
     said = dxlrun("check", torso, "port:=/dev/ttyUSB0", "rate:=100")
 
     assert said.code == 2
-    assert "the highest possible rate is 71 Hz" in said.errors[0]
+    assert "lower the rate to at most 71 Hz" in said.errors[0]
     assert "(argument rate:=100)" in said.errors[0]
 
 

@@ -101,14 +101,14 @@ def test_python_gets_the_same_pose(pair: Path) -> None:
     ("words", "expected"),
     [
         (["--at", "pan=1rad"], "--at and --relative-to are for one frame; name it by --of"),
-        (["--of", "jam"], "there is no frame jam; did you mean jaw?"),
+        (["--of", "jam"], "frame jam not found; did you mean jaw?"),
         (["--of", "jaw", "--at", "pan"], "'pan' is not key=value; write for example --at elbow=30deg"),
         (["--of", "jaw", "--at", "pan=1"], "--at pan=1: '1' has no unit; write an angle with its unit"),
         (
             ["--of", "jaw", "--at", "jaw=1deg"],
-            "--at jaw=1deg: '1deg' has the unit deg, which is not one of a",
+            "--at jaw=1deg: '1deg' has the wrong unit deg for a",
         ),
-        (["--of", "jaw", "--at", "pam=1rad"], "there is no joint pam that moves; did you mean pan?"),
+        (["--of", "jaw", "--at", "pam=1rad"], "movable joint pam not found; did you mean pan?"),
         (["--of", "jaw", "--at", "pan=1rad", "--at", "pan=2rad"], "--at pan is given twice; give it once"),
         (["--graph", "tree.png"], "tree.png: the file's suffix must be .svg or .dot"),
     ],

@@ -37,11 +37,11 @@ def test_a_wrong_file_is_refused_with_its_places(dxlrun, no_robot: None, tmp_pat
     file.write_text("positions: [1 deg]\npositions: [2 deg]\n")
     said = dxlrun("send", "head", "posvel", "--file", file)
     assert (said.code, said.errors) == (
-        2, [f"{file}:2:1: positions was already given in line 1; keep one of the two"],
+        2, [f"{file}:2:1: positions is already defined in line 1; keep one of the two"],
     )  # fmt: skip
     said = dxlrun("load", "spare", "--file", tmp_path / "none.yaml")
     assert (said.code, said.errors) == (
-        2, [f"{tmp_path}/none.yaml:1:1: there is no such file; check the path; it counts from here"],
+        2, [f"{tmp_path}/none.yaml:1:1: file not found; check the path, relative to the current directory"],
     )  # fmt: skip
 
 

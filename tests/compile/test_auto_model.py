@@ -16,9 +16,7 @@ def test_a_servo_that_is_not_asked_yet_is_taken_for_its_neighbour():
 
     assert {servo.model for servo in compiled.plan.buses[0].servos} == {"AX-12A"}
     (warning,) = [each for each in compiled.warnings if "model" in each.what]
-    assert warning.what == (
-        "the servo of left_arm_joint reports its model at the start; until then it is taken for an AX-12A"
-    )
+    assert warning.what == ("the model of left_arm_joint is unknown until the start, and checked as AX-12A")
     assert (warning.mark.line, warning.mark.column) == (9, 12)
 
 

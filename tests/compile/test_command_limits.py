@@ -38,7 +38,7 @@ def trajectory(*points: tuple[float, tuple[float, float]], **more: object) -> Tr
 
 
 def longer(factor: float) -> str:
-    return f": give it more time, {factor:g} times as long"
+    return f": allow more time, {factor:g} times as long"
 
 
 def peaks_of(command: CommandModel) -> list[SpeedPeak]:
@@ -65,30 +65,30 @@ def peaks_of(command: CommandModel) -> list[SpeedPeak]:
         (
             PosVelCommand(positions=(0.0, 0.0), velocities=(1e300, 2.1)),
             [
-                f"free is asked for 1e+300 rad/s, {FREE_SPEED}",
-                f"bound is asked for 2.1 rad/s, {BOUND_SPEED}",
+                f"free is commanded to 1e+300 rad/s, {FREE_SPEED}",
+                f"bound is commanded to 2.1 rad/s, {BOUND_SPEED}",
             ],
         ),
-        (VelocitiesCommand(velocities=(-9.0, 0.0)), [f"free is asked for -9 rad/s, {FREE_SPEED}"]),
+        (VelocitiesCommand(velocities=(-9.0, 0.0)), [f"free is commanded to -9 rad/s, {FREE_SPEED}"]),
         (PosEffortCommand(positions=(0.0, 0.0), efforts=(3.0, -0.5)), []),
         (
             EffortsCommand(efforts=(1e9, -0.6)),
             [
-                "free is asked for 1e+09, more than 3, the highest goal of its servo",
-                "bound is asked for -0.6, more than 0.5, its effort limit",
+                "free is commanded to 1e+09, more than 3, the highest goal of its servo",
+                "bound is commanded to -0.6, more than 0.5, its effort limit",
             ],
         ),
         (trajectory((0.0, (0.0, 0.0)), (0.25, (2.0, 0.5)), (0.5, (0.0, 0.0))), []),
         (
             trajectory((0.0, (0.0, 0.0)), (0.2, (2.0, 0.4)), (0.3, (2.0, 0.7))),
             [
-                f"free is asked for 10 rad/s at 0.200 s, from point 1 to 2, {FREE_SPEED}{longer(1.25)}",
-                f"bound is asked for 3 rad/s at 0.300 s, from point 2 to 3, {BOUND_SPEED}{longer(1.5)}",
+                f"free is commanded to 10 rad/s at 0.200 s, from point 1 to 2, {FREE_SPEED}{longer(1.25)}",
+                f"bound is commanded to 3 rad/s at 0.300 s, from point 2 to 3, {BOUND_SPEED}{longer(1.5)}",
             ],
         ),
         (
             trajectory((0.0, (0.0, 0.4)), (1.0, (0.0, -1.0)), velocities=(0.0, 0.0)),
-            [f"bound is asked for -2.1 rad/s at 0.500 s, from point 1 to 2, {BOUND_SPEED}{longer(1.05)}"],
+            [f"bound is commanded to -2.1 rad/s at 0.500 s, from point 1 to 2, {BOUND_SPEED}{longer(1.05)}"],
         ),
         (
             TrajectoryCommand.model_validate(
@@ -100,7 +100,7 @@ def peaks_of(command: CommandModel) -> list[SpeedPeak]:
             trajectory((1.0, (0.0, 5.0)), velocities=(0.0, 3.0)),
             [
                 "bound is sent to 286.479 deg in point 1, outside its limits -57.3..+57.3 deg",
-                f"bound is asked for 3 rad/s in point 1, {BOUND_SPEED}",
+                f"bound is commanded to 3 rad/s in point 1, {BOUND_SPEED}",
             ],
         ),
     ],

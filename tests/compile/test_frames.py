@@ -47,20 +47,20 @@ def test_a_robot_without_a_urdf_has_no_frames() -> None:
         (
             '"right_arm_joint" type="continuous"',
             '"right_arm_joint" type="prismatic"',
-            "the URDF slides right_arm_joint, whose positions are angles, so frames show it at rest; give "
-            "it a travel_per_turn here, or make it revolute there and let what it slides mimic it",
+            "the URDF slides right_arm_joint, but positions are angles: frames show no motion; add "
+            "travel_per_turn here, or make it revolute in the URDF and add a prismatic mimic joint",
         ),
         (
             '"right_arm"/></joint>',
             '"right_arm"/><mimic joint="left_arm_joint"/></joint>',
-            "right_arm_joint follows left_arm_joint in the URDF, but has a servo of its own, and the "
-            "servo counts; remove the mimic from the URDF, or the joint out of this file",
+            "right_arm_joint mimics left_arm_joint in the URDF, but its servo has priority; remove the mimic "
+            "from the URDF, or the joint from this file",
         ),
         (
             '"right_arm_joint"',
             '"rigth_arm_joint"',
-            "the URDF has no joint right_arm_joint; give the joints of both files the same names; until then "
-            "these are not shown",
+            "the URDF has no joint right_arm_joint; use the same names in both files; joints missing "
+            "in the URDF are not shown",
         ),
     ],
 )
@@ -74,8 +74,8 @@ def test_what_moves_otherwise_in_the_urdf_is_a_warning(right: str, wrong: str, e
 @pytest.mark.parametrize(
     ("imu", "expected"),
     [
-        ("gyro", "model.imu is gyro, which is not a device, sensor or controller with states; there is none"),
-        ("arms", "model.imu is arms, which is not a device, sensor or controller with states; there is none"),
+        ("gyro", "model.imu gyro is not a device, sensor or controller with states; there is none"),
+        ("arms", "model.imu arms is not a device, sensor or controller with states; there is none"),
     ],
 )
 def test_an_imu_that_is_no_source_is_an_error_at_its_place(imu: str, expected: str) -> None:
@@ -119,7 +119,7 @@ JAW = """\
         (
             "prismatic",
             "revolute",
-            ["the URDF turns jaw, whose positions are lengths, so frames show it at rest"],
+            ["the URDF turns jaw, but positions are lengths: frames show no motion"],
         ),
     ],
 )
@@ -155,8 +155,8 @@ def test_a_source_without_orientation_turns_nothing() -> None:
     found = problems_in(text + "sensors: {gyro: {type: simulated_imu, rate: 50, link: left_arm}}\n")
     (error,) = [each for each in found if each.severity == "error"]
 
-    assert error.what == "model.imu is gyro, which has no orientation (x, y, z, w)"
-    assert error.fix == "add an imu_sensor_broadcaster that reads it, and name that"
+    assert error.what == "model.imu gyro has no orientation (x, y, z, w)"
+    assert error.fix == "add an imu_sensor_broadcaster for gyro, and write its name"
 
 
 IMUS = """\
@@ -181,13 +181,13 @@ IMUS = """\
         ("tilted", "body, mounting: [0 deg, 30 deg, 0 deg]", "imu, imu_link: body", "imu", ""),
         ("rolled", "body, mounting: [30 deg, 30 deg, 0 deg]", "imu, imu_link: body", "imu", ""),
         ("tilted", "tilted, mounting: [0 deg, 0.5 deg, 0 deg]", "imu, imu_link: tilted", "none", ""),
-        ("body", "bdy", "", "none", "frame: the messages of imu have the frame bdy, which is not a link of the URDF; did you mean body?"),
-        ("left_arm", "body", "", "none", "frame: the messages of imu have the frame body, but unit is on left_arm, which moves against it; write `frame: left_arm`, or how it is turned there as `mounting`"),
-        ("tilted", "body", "", "none", "frame: the messages of imu have the frame body, but unit is on tilted, which is turned by 30 deg against it; write"),
-        ("body", "tilted, mounting: [0 deg, 30 deg, 0 deg]", "", "none", "frame: the messages of imu have the frame tilted, but unit is on body, which is turned by 60 deg against it and its mounting; write"),
-        ("left_arm", "left_arm", "imu, imu_link: body", "none", "imu_link: imu has the orientation of link left_arm, but turns body, which moves against it; write `imu_link: left_arm`"),
-        ("left_arm", "left_arm", "imu", "none", "imu: imu has the orientation of link left_arm, but turns imu_link, which moves against it"),
-        ("tilted", "tilted", "", "imu", "orientation: gravity takes an orientation for that of the URDF's first link body, but imu has that of tilted, which is turned by 30 deg against it; give it that of an IMU on body"),
+        ("body", "bdy", "", "none", "frame: the frame bdy of imu is not a link of the URDF; did you mean body?"),
+        ("left_arm", "body", "", "none", "frame: the frame of imu is body, but unit is on left_arm: these links move relative to each other; write `frame: left_arm`, or the rotation of unit as `mounting`"),
+        ("tilted", "body", "", "none", "frame: the frame of imu is body, but unit is on tilted: these links differ by 30 deg; write"),
+        ("body", "tilted, mounting: [0 deg, 30 deg, 0 deg]", "", "none", "frame: the frame of imu is tilted, but unit is on body: these links differ by 60 deg with the mounting; write"),
+        ("left_arm", "left_arm", "imu, imu_link: body", "none", "imu_link: the frame of imu is left_arm, but its link is body: these links move relative to each other; write `imu_link: left_arm`"),
+        ("left_arm", "left_arm", "imu", "none", "imu: the frame of imu is left_arm, but its link is imu_link: these links move relative to each other"),
+        ("tilted", "tilted", "", "imu", "orientation: gravity uses the orientation of tilted from imu for the URDF's first link body: these links differ by 30 deg; use the orientation of an IMU on body"),
     ],
 )  # fmt: skip
 @pytest.mark.usefixtures("part_plugins")

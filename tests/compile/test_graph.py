@@ -56,7 +56,7 @@ def test_the_chain_of_the_page_is_right():
     ("reads", "warned"),
     [
         ("arm_pid/elbow/position", ""),  # which limiter commands
-        ("limiter/shoulder/position", "which it commands itself: it gets its value of the cycle before"),
+        ("limiter/shoulder/position", "its own command of the previous cycle"),
         ("elbow/position", ""),
     ],
 )
@@ -70,7 +70,7 @@ def test_a_controller_that_reads_what_it_commands_is_warned_about(reads: str, wa
     found = [one for one in compiled.warnings if reads in one.what]
     assert [one.what for one in found] == ([f"arm reads {reads}, {warned}"] if warned else [])
     assert [one.fix for one in found] == (
-        ["read the state, shoulder/position, or remove it"] if warned else []
+        ["read the state shoulder/position, or remove this entry"] if warned else []
     )
 
 
@@ -95,8 +95,8 @@ def test_a_controller_that_reads_itself_is_warned_about_and_can_be_ordered() -> 
     assert [*graph.find_mistakes()] == []
     assert graph.order == ("low", "filter")
     assert [one.what for one in graph.warnings()] == [
-        "low reads low/j/position, its own reference, which it has without",
-        "filter reads filter/x, which it provides itself: it gets its value of the cycle before",
+        "low reads low/j/position, its own reference",
+        "filter reads filter/x, its own state of the previous cycle",
     ]
 
 
@@ -104,4 +104,4 @@ def test_a_mistake_has_its_path_in_the_file() -> None:
     plan = ControllerPlan("up", "part", "", "{}", ("j",), ("position",), (), True, 1, into=("low",))
     (mistake,) = ControllerGraph(("j",), (plan,)).find_mistakes()
     assert mistake.at == ("controllers", "up", "into", 0)
-    assert mistake.what == "`into` of up names low, which is not a controller of the robot"
+    assert mistake.what == "`into` of up names an unknown controller low"

@@ -84,7 +84,7 @@ def test_check_shows_the_policies_of_groups_and_of_returned_servos() -> None:
     compiled = compile_text(text(policies=f"groups: {{{pair}}}"))
     shown = {row.name: row.does for row in compiled.report["policies"]}
     assert shown["on_lost_servo of pair"] == "the group goes limp, the others continue"
-    assert shown["on_returned_servo"] == "hold pan, tilt where they stand, the others limp"
+    assert shown["on_returned_servo"] == "hold pan, tilt, other servos limp"
 
 
 @pytest.mark.parametrize(

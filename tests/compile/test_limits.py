@@ -100,14 +100,14 @@ def peak(speed: float, time: float) -> SpeedPeak:
     ("rows", "peaks", "told"),
     [
         (((0, 0.0, 2.0), (1, 0.0, -2.0)), [peak(-2.0, 0.5)], []),
-        (((0, 0.0, -2.1),), [], ["warning: arm is asked for 2.1 rad/s at 2.000 s, more than 2 rad/s, its velocity limit"]),
-        (((0, 0.0, 2.1), (1, 0.0, -7.9)), [], ["warning: arm is asked for 7.9 rad/s at 3.000 s"]),
-        (((0, 0.0, -8.1),), [], ["arm is asked for 8.1 rad/s at 2.000 s, more than 8 rad/s, the top speed of its servo"]),
+        (((0, 0.0, -2.1),), [], ["warning: arm is commanded to 2.1 rad/s at 2.000 s, more than 2 rad/s, its velocity limit"]),
+        (((0, 0.0, 2.1), (1, 0.0, -7.9)), [], ["warning: arm is commanded to 7.9 rad/s at 3.000 s"]),
+        (((0, 0.0, -8.1),), [], ["arm is commanded to 8.1 rad/s at 2.000 s, more than 8 rad/s, the top speed of its servo"]),
         (((0, -0.5, None), (0.25, 0.5, None)), [], []),  # nothing moves between the two
-        (((0, -0.5, None), (0.25, 0.5, None)), [peak(4.0, 0.25)], ["warning: arm is asked for 4 rad/s at 2.250 s"]),
-        (((0, 0.5, 0.0), (0.25, -0.5, 0.0)), [peak(-6.0, 0.125)], ["warning: arm is asked for 6 rad/s at 2.125 s"]),
-        (((0, 0.5, 0.0), (0.1, -0.5, 0.0)), [peak(-15.0, 0.05)], ["arm is asked for 15 rad/s at 2.050 s"]),
-        (((0, 0.5, 3.0), (0.1, 0.5, 0.0)), [peak(-2.5, 0.05)], ["warning: arm is asked for 3 rad/s at 2.000 s"]),
+        (((0, -0.5, None), (0.25, 0.5, None)), [peak(4.0, 0.25)], ["warning: arm is commanded to 4 rad/s at 2.250 s"]),
+        (((0, 0.5, 0.0), (0.25, -0.5, 0.0)), [peak(-6.0, 0.125)], ["warning: arm is commanded to 6 rad/s at 2.125 s"]),
+        (((0, 0.5, 0.0), (0.1, -0.5, 0.0)), [peak(-15.0, 0.05)], ["arm is commanded to 15 rad/s at 2.050 s"]),
+        (((0, 0.5, 3.0), (0.1, 0.5, 0.0)), [peak(-2.5, 0.05)], ["warning: arm is commanded to 3 rad/s at 2.000 s"]),
     ],
 )  # fmt: skip
 def test_speeds_of_either_sign_are_compared(
@@ -126,7 +126,7 @@ def test_a_peak_is_reported_at_the_point_that_its_way_leads_to() -> None:
     check_samples(listed, 0, {"arm": ARM}, problems, [peak(-2.4, 1.5)])
     (warning,) = problems.warnings
     assert warning.mark.line == 5
-    assert "give it more time, 1.2 times as long, or raise the limit" in warning.fix
+    assert "allow more time, 1.2 times as long, or raise the limit" in warning.fix
 
 
 @pytest.mark.parametrize(
@@ -147,9 +147,10 @@ def test_speeds_and_efforts_of_commands_have_a_magnitude(sign: int) -> None:
     assert beyond_limits((ARM,), EffortsCommand(efforts=(sign * 0.5,))) == []
     (speed,) = beyond_limits((ARM,), VelocitiesCommand(velocities=(sign * 2.001,)))
     (effort,) = beyond_limits((ARM,), EffortsCommand(efforts=(sign * 0.501,)))
-    assert speed.text == f"arm is asked for {sign * 2.001:g} rad/s, more than 2 rad/s, its velocity limit"
-    assert effort.text == f"arm is asked for {sign * 0.501:g}, more than 0.5, its effort limit"
+    assert speed.text == f"arm is commanded to {sign * 2.001:g} rad/s, more than 2 rad/s, its velocity limit"
+    assert effort.text == f"arm is commanded to {sign * 0.501:g}, more than 0.5, its effort limit"
     (slow,) = beyond_limits((SLIDE,), VelocitiesCommand(velocities=(sign * 0.11,)))
     assert (
-        slow.text == f"slide is asked for {sign * 0.11:g} m/s, more than 0.1 m/s, the top speed of its servo"
+        slow.text
+        == f"slide is commanded to {sign * 0.11:g} m/s, more than 0.1 m/s, the top speed of its servo"
     )

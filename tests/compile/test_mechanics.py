@@ -112,5 +112,5 @@ def test_a_motion_gives_linear_joints_lengths() -> None:
     plan = compile_text(TEXT, motion.replace("§", "20 mm")).plan
     assert plan.loop.commands
     (problem,) = [p for p in problems_in(TEXT, motion.replace("§", "20 deg")) if p.severity == "error"]
-    assert problem.what == "grip is linear, and its position is in rad"
+    assert problem.what == "grip is linear, so its position cannot be in rad"
     assert problem.mark.line == 5

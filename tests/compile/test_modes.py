@@ -70,4 +70,4 @@ def test_torque_of_poses_is_limited_in_protocol_1_and_refused_at_its_key_where_n
     _, at = desk.pointed(text, key, f"§{key}")
     assert f"{problem.mark.line}:{problem.mark.column}" == at
     assert problem.what.endswith("XL430-W250 of elbow has no position mode with an effort limit")
-    assert problem.fix == f"remove {key[:-1]}, or use a model that has it"
+    assert problem.fix == f"remove {key[:-1]}, or use another model"

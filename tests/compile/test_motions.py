@@ -119,7 +119,7 @@ def test_commands_of_several_files_are_sorted_by_time():
 def test_motion_for_a_controller_that_still_plays_another_one_is_refused():
     (problem,) = problems_in(PAIR, POSVEL, POSVEL.replace("start: 2 s", "start: 2100 ms"))
 
-    assert "gets this motion at 2.1 s, while it still plays that of" in problem.what
+    assert "starts at 2.1 s, but the motion at" in problem.what
 
 
 def test_mistakes_of_form_of_robot_and_motion_are_reported_together_and_before_others():
@@ -194,7 +194,8 @@ def test_a_trajectory_faster_than_the_servo_is_refused_also_without_a_velocity_l
     assert problem.severity == "error"
     assert (problem.mark.line, problem.mark.column) == (11, 11)
     assert problem.what == (
-        "left_arm_joint is asked for 10 rad/s at 1.100 s, more than 8.238 rad/s, the top speed of its servo"
+        "left_arm_joint is commanded to 10 rad/s at 1.100 s, more than 8.238 rad/s, "
+        "the top speed of its servo"
     )
 
 
@@ -204,7 +205,8 @@ def test_a_trajectory_faster_than_the_files_limit_is_a_warning(way: str):
     (problem,) = problems_in(limited, TOO_FAST.replace("57.3", "40").replace("20 deg", f"{way} deg"))
     assert problem.severity == "warning"
     assert (
-        "right_arm_joint is asked for 3.491 rad/s at 1.100 s, more than 3 rad/s, its velocity" in problem.what
+        "right_arm_joint is commanded to 3.491 rad/s at 1.100 s, more than 3 rad/s, its velocity"
+        in problem.what
     )
 
 
@@ -213,11 +215,11 @@ def test_single_goals_of_a_group_controller_may_be_far_apart_but_their_speeds_ar
     assert problems_in(PAIR, speeds) == ()
     (problem,) = problems_in(PAIR, speeds.replace("1 rad/s", "9 rad/s", 1))
     assert problem.severity == "error"
-    assert "left_arm_joint is asked for 9 rad/s at 0.000 s" in problem.what
+    assert "left_arm_joint is commanded to 9 rad/s at 0.000 s" in problem.what
 
 
 def test_a_formula_faster_than_the_servo_is_refused():
     fast = TRAJECTORY.replace("t / 10, velocity: 0.1", "t / 10, velocity: 9")
     (problem,) = problems_in(SPARE_ACTIVE, fast)
     assert problem.severity == "error"
-    assert "right_arm_joint is asked for 9 rad/s" in problem.what
+    assert "right_arm_joint is commanded to 9 rad/s" in problem.what

@@ -121,7 +121,7 @@ def test_the_p_gain_is_the_one_that_the_servo_has() -> None:
     (warning,) = problems_in(ROBOT)
     assert (warning.severity, warning.what) == (
         "warning",
-        "shoulder was identified with p_gain = 16, and servos begin with 32",
+        "shoulder was identified with p_gain = 16, but servos start with 32",
     )
     assert problems_in(_shoulder("registers: {p_gain: 32}")) == ()
 
@@ -139,8 +139,8 @@ def test_a_file_is_looked_for_beside_the_file_that_names_it() -> None:
 @pytest.mark.parametrize(
     ("change", "at", "what"),
     [
-        ({"model": "MX-28"}, "robot.yaml:6", "shoulder.yaml is of an MX-28, but shoulder is an MX-64"),
-        ({"p_gain": None}, "shoulder.yaml:11", "gives a position_gain without the p_gain at which it was"),
+        ({"model": "MX-28"}, "robot.yaml:6", "shoulder.yaml describes an MX-28, but shoulder is an MX-64"),
+        ({"p_gain": None}, "shoulder.yaml:11", "has a position_gain without a p_gain"),
     ],
 )
 def test_a_file_that_does_not_fit_is_refused(change: dict[str, object], at: str, what: str) -> None:
@@ -192,8 +192,8 @@ def test_mistakes_of_a_motor_file_of_two_joints_are_reported_once_with_those_of_
 def test_a_file_that_is_missing_or_something_else_is_one_error() -> None:
     MOTOR_FILE.unlink()
     (problem,) = problems_in(ROBOT)
-    assert (problem.mark.line, problem.what) == (6, "there is no motor file shoulder.yaml")
-    assert "let `dxlrun identify` write it" in problem.fix
+    assert (problem.mark.line, problem.what) == (6, "motor file shoulder.yaml not found")
+    assert "make the file by `dxlrun identify`" in problem.fix
     MOTOR_FILE.mkdir()
     assert [each.what for each in problems_in(ROBOT)] == ["this is a directory"]
     (problem,) = problems_in(ROBOT.replace("shoulder.yaml", "robot.yaml"))
@@ -208,7 +208,7 @@ def test_a_controller_that_needs_motors_is_refused_where_there_are_none(part_plu
     assert problems_in(NEEDING.replace("direction: 1}", "direction: 1, motor: shoulder.yaml}")) == ()
     MOTOR_FILE.write_text(motor_text(replace(MOTOR, model="MX-28"), {}))
     assert [each.what for each in problems_in(NEEDING.replace("shoulder, elbow]", "shoulder]"))] == [
-        "shoulder.yaml is of an MX-28, but shoulder is an MX-64"
+        "shoulder.yaml describes an MX-28, but shoulder is an MX-64"
     ]
 
 

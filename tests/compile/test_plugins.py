@@ -80,7 +80,7 @@ def test_its_topics_are_in_the_plan_and_none_is_that_of_a_bus():
     (controller,) = compile_text(text).plan.loop.controllers
     assert controller.topics == ("/mine/main",)
     (problem,) = problems_in(text.replace("mine:", "bus:"))
-    assert (problem.what, problem.fix) == ("/bus/main is the topic of a bus", "call bus otherwise")
+    assert (problem.what, problem.fix) == ("/bus/main is the topic of a bus", "rename controller bus")
 
 
 @pytest.mark.usefixtures("foreign_plugins")
@@ -195,7 +195,7 @@ def test_what_its_interfaces_raise_is_an_error_of_the_file():
 def test_what_its_motions_raise_is_a_warning_of_the_file():
     plan = compile_text(FOREIGN.replace("foreign", "sleepy"))
     (warning,) = plan.warnings
-    assert "controller mine (elsewhere 2.1): the speeds of its motions are not checked" in warning.what
+    assert "controller mine (elsewhere 2.1): the speeds of its motions cannot be checked" in warning.what
     assert "RuntimeError: not today" in warning.what
 
 
@@ -223,5 +223,5 @@ def test_more_controllers_than_a_cycle_can_hold_are_refused():
 
     (problem,) = problems_in(PAIR + many)
 
-    assert problem.what == "the file has 64 controllers, the most are 63"
+    assert problem.what == "the file has 64 controllers, more than 63"
     assert (problem.mark.line, problem.mark.column) == (19, 1)

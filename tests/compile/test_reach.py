@@ -48,7 +48,7 @@ def test_a_reference_outside_of_a_travel_to_both_sides_of_0_is_a_warning():
 
     assert warnings(-3.1) == []
     assert len(warnings(-3.2)) == 2
-    assert "(-180..180 deg), so the joint can never be at 0" in warnings(-3.2)[0]
+    assert "(-180..180 deg), so the joint cannot reach 0" in warnings(-3.2)[0]
 
 
 @pytest.mark.parametrize(

@@ -26,8 +26,8 @@ def test_a_latency_timer_ends_1_khz_and_the_highest_rate_is_named():
     problems = [one for one in caught.value.problems if one.severity == "error"]
     assert [one.what.split()[4] for one in problems] == BUSES
     for one in problems:
-        assert "1000 Hz (argument rate:=1000) leave 1 ms" in one.what
-        assert "the highest possible rate is 719 Hz" in one.what
+        assert "1000 Hz (argument rate:=1000) is 1 ms" in one.what
+        assert "lower the rate to at most 719 Hz" in one.fix
         assert "an adapter without a latency timer would allow 2564 Hz" in one.fix
 
 

@@ -151,4 +151,4 @@ def test_a_client_may_change_only_ram_of_its_own(name, said):
 def test_of_a_model_that_is_still_to_be_asked_what_fits_the_usual_one_is_taken():
     found, warnings = declared("{position_p_gain: 900, p_gain: 3}", model="auto")
     assert [one.name for one in found] == ["position_p_gain"]
-    assert "reports its model at the start" in " ".join(one.what for one in warnings)
+    assert "is unknown until the start" in " ".join(one.what for one in warnings)

@@ -132,8 +132,8 @@ def test_a_real_port_does_not_use_it_and_refuses_nothing(monkeypatch: pytest.Mon
     assert not compiled.plan.simulated
     assert [each.what for each in compiled.warnings if "physics: mujoco" in each.what] == [
         "with physics: mujoco the URDF defines the gravity of left_arm_joint",
-        "physics: mujoco moves the bodies of a URDF, and the file names none",
-        "physics: mujoco needs MuJoCo, which is not installed",
+        "physics: mujoco needs a URDF",
+        "MuJoCo, needed for physics: mujoco, is not installed",
     ]
 
 
@@ -154,7 +154,7 @@ def test_mujoco_that_is_not_installed_is_named_with_its_extra(monkeypatch: pytes
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     text = SIMULATED + "model: {urdf: pair.urdf}\nsimulation: {physics: mujoco}\n"
     (problem,) = [each for each in problems_in(text) if each.severity == "error"]
-    assert problem.what == "physics: mujoco needs MuJoCo, which is not installed"
+    assert problem.what == "MuJoCo, needed for physics: mujoco, is not installed"
     assert "pip install 'dxlrun[physics]'" in problem.fix
 
 
@@ -203,13 +203,13 @@ def test_bodies_that_cannot_be_moved_are_told_before_a_process_starts() -> None:
 def test_mujoco_that_cannot_be_loaded_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     plan = compile_text(_with_bodies(SIMULATED)).plan
     monkeypatch.setitem(sys.modules, "mujoco", None)
-    with pytest.raises(InputError, match=r"needs MuJoCo.*pip install 'dxlrun\[physics\]'"):
+    with pytest.raises(InputError, match=r"MuJoCo, needed.*pip install 'dxlrun\[physics\]'"):
         simulation_of(plan)
 
 
 def test_bodies_without_a_urdf_are_told_when_a_real_port_is_simulated_after_all() -> None:
     plan = compile_text(PAIR + "simulation: {physics: mujoco}\n").plan
-    with pytest.raises(InputError, match=r"the file names none; write `model: \{urdf: \.\.\.\}`"):
+    with pytest.raises(InputError, match=r"needs a URDF; write `model: \{urdf: \.\.\.\}`"):
         simulation_of(plan)
 
 

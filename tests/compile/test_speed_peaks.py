@@ -39,7 +39,7 @@ motions:
       - {time: 2 s, joints: {elbow: {position: 0.8 rad, velocity: 0 rad/s}}}
 """
 SLOW = ROBOT.replace("TIME", "2 s").replace("WAY", "smooth")
-PEAK = "elbow is asked for 1.2 rad/s at"
+PEAK = "elbow is commanded to 1.2 rad/s at"
 """0.8 rad in 1 s from rest to rest: 0.8 rad/s on average, 1.5 times as much in the middle."""
 MORE = "more than 1 rad/s, its velocity limit"
 
@@ -71,7 +71,7 @@ def test_a_motion_file_is_judged_by_the_peak_between_its_points(tmp_path: Path) 
     (problem,) = problems_of(tmp_path, SLOW, MOTION)
     assert (problem.severity, problem.mark.line) == ("warning", 7)
     assert problem.what == f"{PEAK} 1.500 s, {MORE}"
-    assert "give it more time, 1.2 times as long" in problem.fix
+    assert "allow more time, 1.2 times as long" in problem.fix
     assert problems_of(tmp_path, SLOW, MOTION.replace("2 s", "2.21 s")) == []
 
 
@@ -79,7 +79,7 @@ def test_a_motion_file_beyond_the_servo_is_an_error(tmp_path: Path) -> None:
     (problem,) = problems_of(tmp_path, SLOW, MOTION.replace("2 s", "1.1 s"))
     assert (problem.severity, problem.what.split(",")[0]) == (
         "error",
-        "elbow is asked for 12 rad/s at 1.050 s",
+        "elbow is commanded to 12 rad/s at 1.050 s",
     )
     assert "the top speed of its servo" in problem.what
 
@@ -87,7 +87,7 @@ def test_a_motion_file_beyond_the_servo_is_an_error(tmp_path: Path) -> None:
 def test_a_command_is_refused_by_the_same_sentence(tmp_path: Path) -> None:
     with pytest.raises(RefusedRequest) as refused:
         send(tmp_path, "arm", "trajectory", points=points((1.0, 0.0), (2.0, 0.8)))
-    assert f"{PEAK} 1.500 s, from point 1 to 2, {MORE}: give it more time, 1.2 times as long" in str(
+    assert f"{PEAK} 1.500 s, from point 1 to 2, {MORE}: allow more time, 1.2 times as long" in str(
         refused.value
     )
     send(tmp_path, "arm", "trajectory", points=points((1.0, 0.0), (2.21, 0.8)))
@@ -119,4 +119,4 @@ def test_a_way_back_to_the_first_pose_of_a_repetition_counts(tmp_path: Path) -> 
         "time: 2 s, pose: {elbow: 0", "time: 1 s, pose: {elbow: 0", 1
     )
     (problem,) = problems_of(tmp_path, again)
-    assert "elbow is asked for -1.2 rad/s at 3.500 s, on the way to step 1 of there" in problem.what
+    assert "elbow is commanded to -1.2 rad/s at 3.500 s, on the way to step 1 of there" in problem.what

@@ -37,7 +37,7 @@ def test_a_robot_without_one_has_none():
     ("right", "wrong", "expected"),
     [
         ("right_arm_joint", "other_joint", "the URDF has no joint right_arm_joint"),
-        ("continuous", "fixed", "the URDF does not let right_arm_joint turn"),
+        ("continuous", "fixed", "right_arm_joint cannot turn in the URDF"),
         (
             "-4.2",
             "-1",
@@ -69,7 +69,7 @@ def test_a_speed_above_that_of_the_urdf_is_a_warning():
             (2, 2),
             "DOCTYPE is not allowed; remove it",
         ),
-        ("<robot>\x01</robot>", (1, 8), "the character U+0001 cannot stand in URDF; remove it"),
+        ("<robot>\x01</robot>", (1, 8), "the character U+0001 is not allowed in URDF; remove it"),
     ],
 )
 def test_what_is_no_urdf_is_an_error_at_its_place(text: str, place: tuple[int, int], expected: str):
@@ -88,7 +88,7 @@ def test_a_missing_urdf_is_an_error_in_the_file_that_names_it():
 
     (error,) = [each for each in caught.value.problems if each.severity == "error"]
     assert error.mark == Mark(str(Path.cwd() / "sub" / "look.yaml"), 1, 15)
-    assert error.what == "there is no URDF gone.urdf"
+    assert error.what == "URDF gone.urdf not found"
 
 
 def test_the_urdf_of_a_fragment_lies_beside_the_fragment():

@@ -55,18 +55,16 @@ def test_a_wrong_value_is_shown_at_its_use_with_the_argument_named() -> None:
 
 def test_an_unknown_argument_is_answered_with_the_nearest() -> None:
     assert desk.refusals(TORSO, {"prot": "sim", "x": "1"}) == [
-        "command line:1:1: prot:=sim was given, but the robot file has no argument 'prot'; did you mean port?",
-        "command line:1:1: x:=1 was given, but the robot file has no argument 'x'; the arguments are port, rate",
+        "command line:1:1: argument prot:=sim is not declared in the robot file; did you mean port?",
+        "command line:1:1: argument x:=1 is not declared in the robot file; known arguments: port, rate",
     ]
     text = TORSO.replace("rate: ${rate}", "rate: ${rat}")
-    assert desk.refusals(text) == ["robot.yaml:8:9: there is no argument 'rat'; did you mean rate?"]
+    assert desk.refusals(text) == ["robot.yaml:8:9: argument 'rat' is not declared; did you mean rate?"]
 
 
 def test_without_an_arguments_block_there_are_none() -> None:
     (first, second, *_) = desk.refusals("name: x\nloop: {rate: '${rate}'}\n", {"rate": "1"})
-    assert first.startswith(
-        "command line:1:1: rate:=1 was given, but the robot file has no argument 'rate'; remove it"
-    )
+    assert first.startswith("command line:1:1: argument rate:=1 is not declared in the robot file; remove it")
     assert "has no" in second
 
 
@@ -90,12 +88,12 @@ def test_an_argument_without_default_must_be_given() -> None:
         ),
         (
             "arguments: {a: {default: [1]}}",
-            "2:26: arguments.a.default: the default of an argument is one value",
+            "2:26: arguments.a.default: the default of an argument must be one value",
         ),
         ("arguments: {a: {default: 1, help: 5}}", "2:35: arguments.a.help is 5, but must be text"),
-        ("arguments: {a b: {default: 1}}", "2:13: 'a b' is not a name of an argument"),
-        ("arguments: {a: {default: '${b}'}}", "2:26: an argument's default cannot use ${...}"),
-        ("arguments: {a: {default: 1}, a: {default: 2}}", "2:30: arguments.a was already given in line 2"),
+        ("arguments: {a b: {default: 1}}", "2:13: 'a b' is not a valid name of an argument"),
+        ("arguments: {a: {default: '${b}'}}", "2:26: the default of an argument cannot contain ${...}"),
+        ("arguments: {a: {default: 1}, a: {default: 2}}", "2:30: arguments.a is already defined in line 2"),
     ],
 )
 def test_a_wrong_block_is_refused_where_it_stands(block: str, problem: str) -> None:
@@ -108,8 +106,8 @@ def test_a_wrong_block_is_refused_where_it_stands(block: str, problem: str) -> N
 def test_what_is_no_argument_is_said() -> None:
     text = TORSO.replace("directory: elsewhere", 'directory: "${rate"').replace("${rate}\n", "${a b}\n")
     assert desk.refusals(text) == [
-        "robot.yaml:8:9: there is no argument 'a b'; the arguments are port, rate",
-        "robot.yaml:17:24: a ${ is not closed; write ${name}, or $${ for a plain ${",
+        "robot.yaml:8:9: argument 'a b' is not declared; known arguments: port, rate",
+        "robot.yaml:17:24: ${ has no closing }; write ${name}, or $${ for a literal ${",
     ]
 
 

@@ -23,7 +23,7 @@ FOREIGN = [
     (
         "a.yaml",
         "robot: {type: so101_follower, port: /dev/ttyACM0}",
-        "LeRobot; its arms have servos of Feetech",
+        "LeRobot; use arms with Dynamixel servos",
     ),
     ("a.yaml", "teleop: {type: koch_leader, port: x, id: y}", "LeRobot; `dxlrun examples koch`"),
     ("a.yaml", "type: koch_follower\nport: /dev/ttyACM0\ncameras: {}", "a configuration of LeRobot"),
@@ -33,7 +33,7 @@ FOREIGN = [
     ("a.yaml", "arm_controller:\n  ros__parameters: {joints: [a], buses: 3}", "file of ROS 2"),
     ("a.yaml", "arm: {pan: {type: effort_controllers/JointPositionController, joint: pan}}", "file of ROS"),
     ("a.json", '{"controllers": {"bus": {}}, "motorgroups": {}, "motors": {}}', "a configuration of pypot"),
-    ("a.urdf", '<?xml version="1.0"?>\n<robot name="x"/>', "a URDF, which describes a body and no servos"),
+    ("a.urdf", '<?xml version="1.0"?>\n<robot name="x"/>', "a URDF: a body without servos"),
     ("a.urdf", '<robot xmlns:xacro="http://ros.org/wiki/xacro" name="x"/>', "by `xacro a.urdf > a.urdf`"),
     ("a.mtn", "type=motion\nversion=1.01\npage_begin\nname=march\n", "a motion file of RoboPlus"),
     ("a.yaml", "pan: {ID: 1, Return_Delay_Time: 0}\ntilt: {ID: 2}", "dynamixel_workbench"),
@@ -92,7 +92,7 @@ def test_a_robot_file_with_foreign_words_is_read_as_robot_file(text: str, tmp_pa
         ("position_controllers/JointGroupPositionController", "write joint_group_position_controller"),
         ("imu_sensor_broadcaster/IMUSensorBroadcaster", "write imu_sensor_broadcaster"),
         ("position_controllers/GripperActionController", "write gripper_controller"),
-        ("admittance_controller/AdmittanceController", "dxlrun has none of this name"),
+        ("admittance_controller/AdmittanceController", "choose a type of dxlrun"),
     ],
 )
 def test_a_type_of_ros_is_answered_with_ours(written: str, fix: str) -> None:

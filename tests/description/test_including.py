@@ -87,7 +87,7 @@ def test_mistakes_are_said_where_they_stand_and_all_at_once(including: str) -> N
     assert desk.refusals(including.replace("direction: 1}", "direction: 2}")) == [
         "fragments/head.yaml:5:24: joints.yaw.id is the text 'x', but must be a whole number; "
         "write for example `id: 1`",
-        "fragments/head.yaml:5:95: there is no argument 'sped'; did you mean speed?",
+        "fragments/head.yaml:5:95: argument 'sped' is not declared; did you mean speed?",
         "robot.yaml:13:75: joints.elbow.direction is 2, but must be 1 or -1; write one of them",
     ]
 
@@ -157,9 +157,12 @@ def test_depth_number_and_size_are_bounded() -> None:
         desk.write("#" * 600_000 + "\n{}", name)
 
     for includes, expected in (
-        (["deep0.yaml"], f"includes go deeper than {MOST_LEVELS} files; include it further up"),
-        (names, f"more than {MOST_FILES} files are included; put some of them together"),
-        (["large1.yaml", "large2.yaml"], "with large2.yaml the robot has more than 1024 KiB; shorten it"),
+        (["deep0.yaml"], f"nested deeper than {MOST_LEVELS} files; include deep7.yaml in the robot file"),
+        (names, f"more than {MOST_FILES} files are included; merge some of them"),
+        (
+            ["large1.yaml", "large2.yaml"],
+            "with large2.yaml the robot file is larger than 1024 KiB; shorten one of its files",
+        ),
     ):
         problems = desk.refusals(f"include: [{', '.join(includes)}]\n{TORSO}")
         assert any(problem.endswith(expected) for problem in problems), problems
@@ -170,9 +173,9 @@ def test_fragments_that_cannot_be_read_are_named_at_the_include() -> None:
     (Path.cwd() / "folder.yaml").mkdir()
 
     assert desk.refusals(f"include: [gone.yaml, broken.yaml, folder.yaml]\n{TORSO}") == [
-        "robot.yaml:1:11: there is no file gone.yaml; "
+        "robot.yaml:1:11: file gone.yaml not found; "
         "check the name; it is relative to the folder of this file",
-        "broken.yaml:1:4: the [ that is opened here is not closed; write ] at the end",
+        "broken.yaml:1:4: this [ is not closed; write ] at the end",
         "robot.yaml:1:35: folder.yaml: this is a directory; name a YAML file",
     ]
 
@@ -181,7 +184,7 @@ def test_a_key_given_twice_inside_one_file_is_still_a_mistake(including: str) ->
     desk.write(HEAD + "controllers: {}\n", "fragments/head.yaml")
 
     assert desk.refusals(including) == [
-        "fragments/head.yaml:8:1: controllers was already given in line 6; keep one of the two"
+        "fragments/head.yaml:8:1: controllers is already defined in line 6; keep one of the two"
     ]
 
 

@@ -34,15 +34,15 @@ def test_a_robot_file_is_no_motion_and_a_motion_no_robot() -> None:
     folder = Path.cwd()
 
     assert desk.refusals(motion) == [
-        f"robot.yaml:2:1: this is a motion file, and no robot; run it with `dxlrun ROBOT.yaml --play {folder}/robot.yaml`".replace(
+        f"robot.yaml:2:1: this is a motion file, not a robot file; run it with `dxlrun ROBOT.yaml --play {folder}/robot.yaml`".replace(
             f"{folder}/", ""
         )
     ]
     assert desk.refusals("model: MX-64\ntorque_constant: 1.6 Nm/A\n") == [
-        "robot.yaml:2:1: this is a motor file, and no robot; name it in a robot file, at the joint: `motor: robot.yaml`"
+        "robot.yaml:2:1: this is a motor file, not a robot file; name it in a robot file, at the joint: `motor: robot.yaml`"
     ]
     assert desk.motion_refusals(TORSO) == [
-        "motion.yaml:1:1: this is a robot file, and no motion; run it with `dxlrun motion.yaml`, and give --play a motion file"
+        "motion.yaml:1:1: this is a robot file, not a motion; run it with `dxlrun motion.yaml`, and give --play a motion file"
     ]
     assert len(desk.refusals("name: x\nmotions: []\njoints: {}\n")) > 1  # a robot with a key too much
 
@@ -69,11 +69,11 @@ def test_points_and_formulas_become_si_units() -> None:
 DAMAGES = [
     ("time: 1 s", "time: §1", "motions[0].points[0].time: 1 has no unit; write a duration"),
     ("position: 90 deg", "position: §90", "motions[0].points[0].joints.yaw.position: 90 has no unit; write an"),
-    ("velocity: 0.5 rad/s", "velocity: §0.5 rad", "motions[0].points[0].joints.yaw.velocity: '0.5 rad' has the unit"),
+    ("velocity: 0.5 rad/s", "velocity: §0.5 rad", "motions[0].points[0].joints.yaw.velocity: '0.5 rad' has the wrong unit"),
     ("{position: 0 rad}", "§{}", "motions[0].points[0].joints.pitch: the target is empty; give it"),
     ("{time: 2 s, ", "§{", "motions[0].points[1] has no time; add `time: 1 s`"),
     ("{time: 2 s, ", "{time: 2 s, §tiem: 3, ", "motions[0].points[1] has an unknown key 'tiem'; did you mean time?"),
-    ("start: 500 ms", "§samples: 5", "motions[0].samples is not possible; a part has either points, or"),
+    ("start: 500 ms", "§samples: 5", "motions[0].samples is not allowed here; write either points, or"),
     ("start: 500 ms", "§strat: 1 s", "motions[0] has an unknown key 'strat'; did you mean start?"),
     ("samples: 500", "samples: §1", "motions[1].samples is 1, but must be at least 2; write"),
     ("samples: 500", "samples: 500\n    §smaples: 500", "motions[1] has an unknown key 'smaples'; did you mean samples?"),
@@ -82,7 +82,7 @@ DAMAGES = [
     ("velocity: cos(t)", "velocity: §[t]", "motions[1].joints.elbow.velocity is a list, but must be text; write"),
     ("{position: 0}", "{position: §true}", "motions[1].joints.swing.position is true, but must be text; put"),
     ("swing: {position: 0}", "§swing: {velocity: 0}", "motions[1].joints.swing has no position; add"),
-    ("name: wave", "name: §${x}", "this file takes no arguments; write the value itself"),
+    ("name: wave", "name: §${x}", "this file cannot contain ${...}; write the value"),
     ("name: wave\n", "§", "the file has no name; add"),
 ]  # fmt: skip
 

@@ -84,15 +84,15 @@ MISTAKES = [
     ("voltage: 12 V", "voltage: §0 V", "voltage is 0 V, but must be greater than 0; write for example `voltage: 12 V`"),
     ("voltage: 12 V", "voltage: §12", "voltage: 12 has no unit; write a voltage with its unit, such as 12 V"),
     ("resistance: 3.5 ohm", "resistance: §-3.5 ohm", "resistance is -3.5 ohm, but must be greater than 0; write for example `resistance: 3.6 ohm`"),
-    ("resistance: 3.5 ohm", "resistance: §3.5 Nm", "resistance: '3.5 Nm' has the unit Nm, which is not one of a resistance; write it as 3.6 ohm"),
+    ("resistance: 3.5 ohm", "resistance: §3.5 Nm", "resistance: '3.5 Nm' has the wrong unit Nm for a resistance; write a resistance such as 3.6 ohm"),
     ("friction: 0.1 Nm", "friction: §-0.1 Nm", "friction is -0.1 Nm, but must be at least 0; write for example `friction: 0.1 Nm`"),
     ("load_friction: 0.08", "load_friction: §1", "load_friction is 1, but must be less than 1; write for example `load_friction: 0.08`"),
     ("p_gain: 32", "p_gain: §32.5", "p_gain is 32.5, but must be a whole number; write for example `p_gain: 32`"),
-    ("delay: 1.5 ms", "delay: §1 s", "delay: no servo needs over 100 ms; check its unit: some milliseconds are usual"),
+    ("delay: 1.5 ms", "delay: §1 s", "delay: a delay is 100 ms at most; check its unit; a few milliseconds are usual"),
     ("friction: 0.1", "§frictoin: 0.1", "the file has an unknown key 'frictoin'; did you mean friction?"),
     ("gravity: 0.2", "§gravty: 0.2", "load has an unknown key 'gravty'; did you mean gravity?"),
     ("inertia: 0.0112 kg m^2\n", "", "the file has no inertia; add `inertia: 0.011 kg m^2`"),
-    ("model: MX-64", "model: §${model}", "this file takes no arguments; write the value itself"),
+    ("model: MX-64", "model: §${model}", "this file cannot contain ${...}; write the value"),
 ]  # fmt: skip
 
 
@@ -114,8 +114,8 @@ def test_all_mistakes_are_told_at_once() -> None:
 def test_another_file_is_no_motor_file() -> None:
     path = desk.write(TORSO)
     assert desk.caught(lambda: read_motor(path)) == [
-        "robot.yaml:1:1: this is not a motor file: it has none of voltage, torque_constant, resistance, inertia; "
-        "name a file as `dxlrun identify` writes it"
+        "robot.yaml:1:1: this is not a motor file: voltage, torque_constant, resistance, inertia are missing; "
+        "give a motor file from `dxlrun identify`"
     ]
 
 

@@ -66,9 +66,9 @@ def problems(text: str, *, model: type[BaseModel] | None = Parameters) -> list[s
         ("{joints: [a], period: fast}", ["f:2:30: controllers.arm.period is the text 'fast', but must be a number or auto; write a number without quotes"]),
         ("{joints: [a], shape: 5}", ["f:2:29: controllers.arm.shape is 5, but must be a mapping or a list; write `key: value` lines below it, or {key: value, ...} after it"]),
         ("{joints: [a], offset: 3}", ["f:2:30: controllers.arm.offset: 3 has no unit; write an angle with its unit, such as 60 deg or 1.05 rad"]),
-        ("{joints: [a], count: 1.5}", ["f:2:29: controllers.arm.count is 1.5, but must be a whole number; write digits only, without quotes and without a point"]),
-        ("{joints: [a], code: A1}", ["f:2:28: controllers.arm.code is the text 'A1', which does not match ^[a-z]+$; correct it"]),
-        ("{joints: [a], code: abcde}", ["f:2:28: controllers.arm.code is too long; keep 4 at most"]),
+        ("{joints: [a], count: 1.5}", ["f:2:29: controllers.arm.count is 1.5, but must be a whole number; write digits only, without quotes or a decimal point"]),
+        ("{joints: [a], code: A1}", ["f:2:28: controllers.arm.code is the text 'A1', but must match ^[a-z]+$; correct it"]),
+        ("{joints: [a], code: abcde}", ["f:2:28: controllers.arm.code is too long; write at most 4 characters"]),
         ("5", ["f:2:8: controllers.arm is 5, but must be a mapping; write `key: value` lines below it, or {key: value, ...} after it"]),
     ],
 )  # fmt: skip

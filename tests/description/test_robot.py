@@ -147,7 +147,7 @@ controllers:
 def test_ten_mistakes_give_ten_errors_with_their_places() -> None:
     assert desk.refusals(TEN) == [
         "robot.yaml:5:36: buses.main has an unknown key 'baudrate'; did you mean baud_rate?",
-        "robot.yaml:7:9: there is no argument 'rat'; did you mean rate?",
+        "robot.yaml:7:9: argument 'rat' is not declared; did you mean rate?",
         "robot.yaml:8:23: loop.scheduler.policy is the text 'realtime', but must be other, fifo or round_robin;"
         " write one of them",
         "robot.yaml:12:9: joints.swing.id is the text '1', but must be a whole number; remove the quotes",
@@ -157,7 +157,7 @@ def test_ten_mistakes_give_ten_errors_with_their_places() -> None:
         " write [lower, upper]",
         "robot.yaml:17:26: joints.elbow.id is 300, but must be at most 253; write for example `id: 1`",
         "robot.yaml:18:3: joints.head has no reference; add `reference: 150 deg`",
-        "robot.yaml:19:3: joints.elbow was already given in line 17; keep one of the two",
+        "robot.yaml:19:3: joints.elbow is already defined in line 17; keep one of the two",
         "robot.yaml:21:56: controllers.broadcaster.active is the text 'on', but must be true or false;"
         " write for example `active: false`",
     ]

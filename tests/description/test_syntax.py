@@ -21,18 +21,18 @@ from dxlrun.errors import InputError, Mark
 WRONG = [
     (
         "a: {port: ${port}, x: 1}\n",
-        "1:12: ${...} stands inside { } or [ ] without quotes",
-        'quotes: "${name}"',
+        "1:12: ${...} inside { } or [ ] has no quotes",
+        'write "${name}"',
     ),
-    ("a:\n\tb: 1\n", "2:1: there is a tab", "spaces"),
-    ("a: b: c\n", "1:5: there is a ':' where none can be", "quotes"),
-    ("a: [1, 2\nb: 3\n", "1:4: the [ that is opened here is not closed", "write ] at the end of line 1"),
-    ("a: 1\nb: 'x\nc: 1\n", "2:4: a quote is opened here and never closed", "close"),
-    ("a: *x\n", "1:4: this alias names no anchor", "value"),
+    ("a:\n\tb: 1\n", "2:1: the indentation contains a tab", "spaces"),
+    ("a: b: c\n", "1:5: this ':' is not allowed here", "quotes"),
+    ("a: [1, 2\nb: 3\n", "1:4: this [ is not closed", "write ] at the end of line 1"),
+    ("a: 1\nb: 'x\nc: 1\n", "2:4: this quote is not closed", "close"),
+    ("a: *x\n", "1:4: the anchor of this alias is not defined", "value"),
     ("a: @x\n", "1:4: a value cannot start with @", "quotes"),
-    ("- a\nb: 1\n", "2:1: this line", "indent it"),
-    ("a:\n  - 1\n 2\n", "3:2: this line is indented", "indent"),
-    ("a: }\n", "1:4: a value is missing", "write one"),
+    ("- a\nb: 1\n", "2:1: this line", "indent"),
+    ("a:\n  - 1\n 2\n", "3:2: this line does not match the indentation", "indent"),
+    ("a: }\n", "1:4: a value is missing", "write a value"),
     ("a: - b\n", "1:4: a list cannot start here", "new line"),
     ("a: 1\n---\nb: 1\n", "2:1: a second document", "one document"),
     ("", "1:1: the file is empty", "describe"),
@@ -66,7 +66,7 @@ def test_a_missing_file_a_directory_and_a_pipe_are_refused() -> None:
     pipe = Path.cwd() / "pipe"
     os.mkfifo(pipe)
     for path, what in (
-        (Path.cwd() / "none.yaml", "there is no such file"),
+        (Path.cwd() / "none.yaml", "file not found"),
         (Path.cwd(), "this is a directory"),
         (pipe, "this is not a regular file"),
         (Path("\0"), "cannot be read"),
@@ -81,7 +81,7 @@ def test_other_encodings_and_control_characters_are_refused_where_they_stand() -
         "robot.yaml:2:4: the byte 0xe9 is not UTF-8; save the file as UTF-8"
     ]
     assert desk.refusals("é: 1\nb: x\0\n") == [
-        "robot.yaml:2:5: the character U+0000 cannot stand in YAML; remove it"
+        "robot.yaml:2:5: the character U+0000 is not allowed in YAML; remove it"
     ]
 
 
@@ -104,12 +104,12 @@ def test_a_tag_is_refused_and_the_rest_still_checked() -> None:
 def test_duplicate_merge_empty_and_compound_keys_are_refused_together() -> None:
     text = TORSO + "recording: {}\n<<: {a: 1}\n? [a, b]\n: 1\n'': 2\n${rate}: 3\n'<<': 4\n"
     assert [refusal.partition("; known keys: ")[0] for refusal in desk.refusals(text)] == [
-        "robot.yaml:18:1: recording was already given in line 17; keep one of the two",
-        "robot.yaml:19:1: the merge key << is not YAML 1.2; write what joints share into joint_defaults or groups, "
-        "and parts of files into an include",
-        "robot.yaml:20:3: a mapping or a list cannot be a key; write a word before the ':'",
-        "robot.yaml:22:1: a key is empty; write a word before the ':'",
-        "robot.yaml:23:1: arguments are not put into keys; write the key out",
+        "robot.yaml:18:1: recording is already defined in line 17; keep one of the two",
+        "robot.yaml:19:1: the merge key << is not YAML 1.2; put shared keys of joints in joint_defaults or "
+        "groups, and shared sections in an include",
+        "robot.yaml:20:3: a mapping or a list cannot be a key; write a name before the ':'",
+        "robot.yaml:22:1: a key is empty; write a name before the ':'",
+        "robot.yaml:23:1: a key cannot contain ${...}; write the key",
         "robot.yaml:24:1: the file has an unknown key '<<'; remove it",
     ]
 
@@ -128,7 +128,7 @@ def test_an_anchor_bomb_is_refused_before_it_grows(monkeypatch: pytest.MonkeyPat
     lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x]"]
     lines += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 20)]
     (problem,) = desk.refusals("\n".join(lines))
-    assert "when its anchors are put in" in problem
+    assert "after its aliases are expanded" in problem
 
 
 @pytest.mark.usefixtures("loader")

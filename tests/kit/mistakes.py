@@ -3,7 +3,7 @@
 Each text in `tests/compile/mistakes` is a robot file, behind `----` a motion for it, and behind `====` cases:
 
     rate: 25 => rate: §20
-      rate 20 Hz of states does not divide the loop's 50 Hz; the nearest possible is 25
+      rate 20 Hz of states does not divide the loop's 50 Hz; write the nearest possible rate, 25
 
 A case has a line for each change (`\\n` is a new line; `+ ` puts one at the end), and one for each problem:
 at the place of §, or at its own (`9:5: ...`). A case without any is right. `HELP` is the address of the page

@@ -58,7 +58,7 @@ def told(
 def test_a_plugin_that_is_not_installed(told: Told) -> None:
     (line,) = told(install=False)
     assert line.startswith(TYPE_MARK + NOT_OFFERED)
-    assert line.endswith("?") or "install the package that offers it" in line
+    assert line.endswith("?") or "install its package in this environment" in line
 
 
 WRONG = {
@@ -116,23 +116,24 @@ def test_a_plugin_that_is_wrong(told: Told, old: str) -> None:
 ASKED = {
     'Interfaces(parameters.joints, ("position",))': (
         "None",
-        "returns None from interfaces; report it to its author: return dxlrun.Interfaces(joints, command)",
+        "returns None from interfaces; report this to the plug-in's author: return "
+        "dxlrun.Interfaces(joints, command)",
     ),
     'parameters.joints, ("position",)': (
         'list(parameters.joints), ("position",)',
         "returns lists in its interfaces; "
-        "report it to its author: write tuples of names, as in dxlrun.Interfaces",
+        "report this to the plug-in's author: write tuples of names, as in dxlrun.Interfaces",
     ),
     ', ("position",))': (
         ', ("position", "pwm"))',
         "requests incompatible command interfaces: no servo mode combines position and pwm; "
-        "report it to its author: request position (alone, or with velocity or effort), or "
+        "report this to the plug-in's author: request position (alone, or with velocity or effort), or "
         "velocity, effort or pwm alone",
     ),
     '("position",))': (
         '("torque",))',
         "returns wrong interfaces: Invalid enum value 'torque' - at `$.command[0]`; "
-        "report it to its author: write tuples of names, as in dxlrun.Interfaces",
+        "report this to the plug-in's author: write tuples of names, as in dxlrun.Interfaces",
     ),
 }
 

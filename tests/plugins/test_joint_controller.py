@@ -246,19 +246,19 @@ def test_a_wrong_class_is_one_sentence_at_its_place(written: Written, wrong: str
     [
         (
             "../wave.py:Wave",
-            "../wave.py:Wave of head is not a class of a file next to the robot file; write ./wave.py:Wave",
+            "../wave.py:Wave of head is not a class in the folder of the robot file; write ./wave.py:Wave",
         ),
         (
             "/home/wave.py:Wave",
-            "/home/wave.py:Wave of head is not a class of a file next to the robot file; ",
+            "/home/wave.py:Wave of head is not a class in the folder of the robot file; ",
         ),
-        ("wave.py", "wave.py of head is not a class of a file next to the robot file; "),
-        ("./out.py:Wave", "./out.py:Wave of head is not a class of a file next to the robot file; "),
+        ("wave.py", "wave.py of head is not a class in the folder of the robot file; "),
+        ("./out.py:Wave", "./out.py:Wave of head is not a class in the folder of the robot file; "),
         (
             "./gone.py:Wave",
-            "gone.py of controller head cannot be read (No such file or directory); its place is gone.py",
+            "gone.py of controller head cannot be read (No such file or directory); check the file gone.py",
         ),
-        ("./bytes.py:Wave", "bytes.py of controller head cannot be read (it is not UTF-8); "),
+        ("./bytes.py:Wave", "bytes.py of controller head cannot be read (not UTF-8); "),
     ],
 )
 def test_only_files_beside_the_robot_file_are_read(
@@ -283,7 +283,7 @@ def test_wrong_keys_have_their_place(written: Written) -> None:
         "robot.yaml:7:64: controllers.head.frequency: 2 has no unit; write a frequency with its"
     )
     assert second.startswith(
-        "robot.yaml:7:67: controllers.head has an unknown key 'joint'; it is called `joints` here"
+        "robot.yaml:7:67: controllers.head has an unknown key 'joint'; remove it, or `joints`: both mean"
     )
 
 

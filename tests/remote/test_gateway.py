@@ -118,15 +118,15 @@ WRONG = [
     ("POST", "/controllers", LOAD | {"name": "a" * 65}, 422, "invalid", "at most 64"),
     ("POST", "/controllers", LOAD | {"name": "left"}, 409, "name_taken", "there is a controller left already"),
     ("POST", "/controllers", LOAD | {"type": "leg"}, 422, "invalid", "no plug-in offers the controller type leg"),
-    ("POST", "/controllers", LOAD | {"joints": ["pam"]}, 422, "invalid", "more claims joint pam, which is not defined; did you mean pan?"),
+    ("POST", "/controllers", LOAD | {"joints": ["pam"]}, 422, "invalid", "joint pam of more is not defined; did you mean pan?"),
     ("POST", "/controllers", LOAD | {"joints": ["pan", "pan"]}, 422, "invalid", "more names joint pan twice; name it once"),
     ("POST", "/controllers", LOAD | {"joints": 3}, 422, "invalid", "more.joints is 3"),
     ("POST", "/controllers", LOAD | {"rate": "x"}, 422, "invalid", "is not a rate"),
     ("POST", "/controllers", LOAD | {"active": True}, 422, "invalid", "load it, then switch to it"),
     ("POST", "/controllers", LOAD | {"fallback": "nun"}, 422, "invalid", "the fallback nun of more is not a controller"),
     ("POST", "/controllers", LOAD | {"fallback": "more"}, 422, "invalid", "more is its own fallback; name another"),
-    ("POST", "/controllers", LOAD | {"into": "lefty"}, 422, "invalid", "`into` of more names lefty, which is not a controller of the robot; did you mean left?"),
-    ("POST", "/controllers", LOAD | {"into": ["left", "more"]}, 422, "invalid", "left, which exports no reference; no controller of the robot exports any"),
+    ("POST", "/controllers", LOAD | {"into": "lefty"}, 422, "invalid", "`into` of more names an unknown controller lefty; did you mean left?"),
+    ("POST", "/controllers", LOAD | {"into": ["left", "more"]}, 422, "invalid", "left, but left exports no reference; remove `into`; no controller of the robot"),
     ("POST", "/controllers", LOAD | {"into": ["left", "more"]}, 422, "invalid", "`into` of more names more itself"),
     ("POST", "/controllers", LOAD | {"into": 3}, 422, "invalid", "names no controller"),
     ("POST", "/controllers", b"[]", 422, "invalid", "Expected `object`"),
@@ -166,8 +166,7 @@ def test_every_wrong_quantity_is_refused_with_its_place(desk):
     assert content["fields"]["paths"] == ["/positions/0", "/positions/1", "/velocities/0"]
     assert content["fields"]["problems"] == [
         "positions[0]: 30 has no unit; write an angle with its unit, such as 60 deg or 1.05 rad",
-        "positions[1]: '1 rad/s' has the unit rad/s, which is not one of an angle; "
-        "write it as 60 deg or 1.05 rad",
+        "positions[1]: '1 rad/s' has the wrong unit rad/s for an angle; write an angle such as 60 deg or 1.05 rad",
         "velocities[0]: this is not an angular velocity; "
         "write an angular velocity such as 2 rad/s, 30 deg/s or 5 rpm",
     ]

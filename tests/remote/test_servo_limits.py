@@ -49,7 +49,7 @@ def test_an_effort_beyond_the_servos_current_limit_is_refused_with_the_register(
     status, content = desk.ask("POST", "/controllers/push/commands/efforts", {"efforts": [0.3]})
     assert (status, content["code"]) == (422, "beyond_limits")
     assert (
-        "pan is asked for 0.3, more than 0.0538, Current Limit (38) = 20, 0.0538 A, a register of its servo"
+        "pan is commanded to 0.3, more than 0.0538, servo register Current Limit (38) = 20, 0.0538 A"
         in content["refused"]
     )
     assert desk.ask("POST", "/controllers/push/commands/efforts", {"efforts": [-0.05]})[0] == 200

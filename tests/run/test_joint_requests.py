@@ -173,7 +173,7 @@ def test_a_pose_at_the_end_does_not_wait_for_limp_joints(run):
 
 ACTIVE = LIMP.replace(", active: false", "")
 WRONG = [
-    (ACTIVE, "10:3", "controller arm is active from the start and commands elbow, which has torque: off"),
+    (ACTIVE, "10:3", "controller arm is active from the start, but torque is off for elbow"),
     (ROBOT.replace("torque: on", "torque: maybe"), "7:90", "torque is on or off"),
     (ROBOT.replace("torque: on", "torque: 1"), "7:90", "torque is on or off"),
 ]

@@ -63,7 +63,7 @@ def test_a_sensor_that_is_refused_is_not_missed_by_what_reads_it_too(refusals):
 
 def test_a_sensor_has_a_name_of_its_own(refusals):
     (sentence,) = refusals(("  imu: {type", "  turn: {type"))
-    assert sentence.startswith("crane.yaml:11:3: turn is the name of a joint already, and both have states")
+    assert sentence.startswith("crane.yaml:11:3: turn is already the name of a joint with states")
 
 
 def test_a_simulated_sensor_needs_a_urdf_and_simulated_servos(refusals):

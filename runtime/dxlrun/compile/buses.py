@@ -56,7 +56,7 @@ def compile_buses(
         used = {servo.bus for servo in described_servos(file.description)}
         used.update(*(each.buses for each in contributions))
         if name not in used:
-            file.warning(mark, f"bus {name} has no joint", "it will not be opened; remove it")
+            file.warning(mark, f"bus {name} has no joint or device, and is not opened", "remove it")
         wirings = [
             _wiring(servo, row, joints, modes)
             for row, servo in enumerate(servos)
@@ -78,7 +78,7 @@ def compile_buses(
                 protocol=bus.protocol,
             )
         except ValueError as error:
-            file.error(mark, str(error), "change the joints or devices of this bus")
+            file.error(mark, str(error), f"correct the joints or devices of bus {name}")
             continue
         _check_ticks(file, plan)
         for _, stage in stages(SettingsStage, used_features(file.description)):
@@ -101,8 +101,8 @@ def _check_baud_rate(file: RobotFile, name: str, tables: Sequence[ControlTable |
         return
     common = set.intersection(*(set(table.baud_rates.values()) for table in lacking.values()))
     known = ", ".join(f"{each:_}" for each in sorted(common))
-    fix = f"write one of theirs: {known}" if known else "give models with other rates a bus of their own"
-    what = f"no {' or '.join(sorted(lacking))} on bus {name} can run at {rate:_} bit/s"
+    fix = f"write another rate: {known}" if known else "put these models on separate buses"
+    what = f"{' and '.join(sorted(lacking))} on bus {name} cannot run at {rate:_} bit/s"
     if all(table.model in lacking for table in tables):
         file.error(mark, what, fix)
     else:
@@ -160,8 +160,8 @@ def _check_ticks(file: RobotFile, plan: BusPlan) -> None:
         if servo.lower_tick > servo.upper_tick:
             file.error(
                 file.at("joints", joints[servo.own_name], "limits", "position"),
-                f"no position of an {servo.model} lies within the limits of {servo.joint}",
-                f"make them wider than one tick ({servo.position_text(servo.position_per_tick)})",
+                f"the position limits of {servo.joint} contain no tick of the {servo.model}",
+                f"widen the limits to more than one tick ({servo.position_text(servo.position_per_tick)})",
             )
 
 
@@ -175,17 +175,17 @@ def _check_budget(file: RobotFile, plan: BusPlan) -> None:
     link = help_link("the-rate-is-too-high-for-the-bus")
     cycle = f"one cycle on bus {plan.name} takes {budget.total_ns * 1e-6:.1f} ms"
     if share > 1.0:
+        lower = f"lower the rate to at most {_floor(budget.highest_rate_hz)} Hz"
         file.error(
             mark,
-            f"{cycle}, but {rate:g} Hz{given} leave {1e3 / rate:.3g} ms; the highest possible rate is "
-            f"{_floor(budget.highest_rate_hz)} Hz",
-            "; ".join(["lower the rate", *_improvements(plan), link]),
+            f"{cycle}, but the period at {rate:g} Hz{given} is {1e3 / rate:.3g} ms",
+            "; ".join([lower, *_improvements(plan), link]),
         )
     elif share > _COMFORTABLE:
         file.warning(
             mark,
-            f"{cycle}, {share:.0%} of the period; what is left is short for controllers and the system",
-            "; ".join(["expect skipped periods, or lower the rate", *_improvements(plan)]),
+            f"{cycle}, {share:.0%} of the period: little time is left for controllers and the system",
+            "; ".join(["lower the rate, or expect skipped periods", *_improvements(plan)]),
         )
 
 
@@ -204,7 +204,7 @@ def _improvements(plan: BusPlan) -> list[str]:
         old = f"{plan.return_delay_ns * 1e-3:g} us"
         found.append(f"a return delay time of 0 us instead of {old} would allow {rate} Hz")
     if len(plan.servos) > 1:
-        found.append("a second bus would share the servos")
+        found.append("a second bus would shorten the cycle")
     return found
 
 
@@ -269,18 +269,20 @@ def _watchdog_ticks(file: RobotFile, plan: BusPlan) -> int:
         return 0
     mark = file.at("buses", plan.name, "bus_watchdog")
     if plan.protocol != 2.0:
-        fix = "remove it; the guardian switches the torque off when the loop dies"
-        file.error(mark, f"bus {plan.name} has Protocol 1.0, which has no Bus Watchdog", fix)
+        fix = "remove it; the guardian disables torque if the loop exits"
+        file.error(mark, f"Protocol 1.0 of bus {plan.name} has no Bus Watchdog", fix)
         return 0
     if written < least_ns:
-        what = f"a Bus Watchdog of {written * 1e-6:g} ms stops the servos of bus {plan.name} after one failed"
-        fix = (
-            f"write {-(-least_ns // UNIT_NS) * UNIT_NS * 1e-6:g} ms at least, three periods, or 0 ms for none"
+        least_ms = -(-least_ns // UNIT_NS) * UNIT_NS * 1e-6
+        file.error(
+            mark,
+            f"a Bus Watchdog of {written * 1e-6:g} ms stops the servos of bus {plan.name} "
+            "after one failed cycle",
+            f"write at least {least_ms:g} ms (three periods), or 0 ms to disable it",
         )
-        file.error(mark, f"{what} cycle", fix)
     if written > MOST_TICKS * UNIT_NS:
-        what = f"a Bus Watchdog has {MOST_TICKS} steps of {UNIT_NS * 1e-6:g} ms"
-        file.error(mark, what, f"write {MOST_TICKS * UNIT_NS * 1e-9:g} s at most, or 0 ms for none")
+        what = f"a Bus Watchdog has at most {MOST_TICKS} steps of {UNIT_NS * 1e-6:g} ms"
+        file.error(mark, what, f"write at most {MOST_TICKS * UNIT_NS * 1e-9:g} s, or 0 ms to disable it")
         return 0
     # Round up: the watchdog must not trip earlier than the file says.
     return -(-written // UNIT_NS)

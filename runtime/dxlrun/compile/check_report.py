@@ -223,5 +223,5 @@ def _on_returned_servo(buses: Sequence[BusPlan]) -> str:
     servos = [servo for bus in buses for servo in bus.servos]
     held = [servo.joint for servo in servos if servo.torque_on_return]
     if len(held) in {0, len(servos)}:
-        return "hold where it stands" if held else "limp"
-    return f"hold {', '.join(held)} where they stand, the others limp"
+        return "hold its position" if held else "limp"
+    return f"hold {', '.join(held)}, other servos limp"

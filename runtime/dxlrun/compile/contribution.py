@@ -104,7 +104,7 @@ def check_source_names(
             if source.name in owners:
                 file.error(
                     file.key(section, source.name),
-                    f"{source.name} is the name of a {owners[source.name]} already, and both have states",
-                    f"give the {source.kind} another name",
+                    f"{source.name} is already the name of a {owners[source.name]} with states",
+                    f"rename the {source.kind}",
                 )
             owners.setdefault(source.name, source.kind)

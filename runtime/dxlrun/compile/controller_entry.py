@@ -28,8 +28,8 @@ from dxlrun.plan.loop_plan import ControllerPlan, JointPlan
 from dxlwire.modes import CommandName
 
 _OFFERED = (
-    "install the package that offers it into this environment (`pip install PACKAGE`); "
-    "`dxlrun plugins` lists the types that there are"
+    "install its package in this environment (`pip install PACKAGE`); "
+    "`dxlrun plugins` lists the installed types"
 )
 _REMOVED = {
     "joint_limiter": "remove it: the gate keeps all goals within `limits` of their joints",
@@ -90,11 +90,11 @@ class PlugInCode(NamedTuple):
     def broken(self, breach: Breach) -> WrongEntry:
         """Return the WrongEntry for a plug-in class that breaks its contract; its author must fix it."""
         what, fix = breach
-        return self._at_fault(what, f"report it to its author: {fix}")
+        return self._at_fault(what, f"report this to the plug-in's author: {fix}")
 
     def _failed(self, task: str, error: BaseException) -> WrongEntry:
         found = " ".join(f"{type(error).__name__}: {error}".split())
-        return self._at_fault(f"cannot {task}: {found}", "correct its parameters, or its plug-in")
+        return self._at_fault(f"cannot {task}: {found}", "correct the parameters, or the plug-in")
 
     def _at_fault(self, what: str, fix: str) -> WrongEntry:
         path = (f"{self.kind}s", self.name)
@@ -247,6 +247,6 @@ def _joint_mistakes(
         path = ("controllers", name, joint)
         if joint not in joints:
             fix = suggestion(joint, (*joints, *groups))
-            yield Mistake(path, f"{name} claims joint {joint}, which is not defined", fix)
+            yield Mistake(path, f"joint {joint} of {name} is not defined", fix)
         elif joint in claimed[:index]:
             yield Mistake(path, f"{name} names joint {joint} twice", "name it once")

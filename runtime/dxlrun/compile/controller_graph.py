@@ -113,17 +113,14 @@ class ControllerGraph:
         source, _, name = interface.rpartition("/")
         owner, _, joint = source.partition("/")
         if source == plan.name and name in plan.provides:
-            return (
-                "which it provides itself: it gets its value of the cycle before",
-                "keep it in the controller",
-            )
+            return "its own state of the previous cycle", "keep the value in the controller"
         if owner == plan.name and joint:
-            return "its own reference, which it has without", "remove it"
+            return "its own reference", "remove it"
         commanded = name in plan.command and joint in plan.joints
         if commanded and owner in [lower.name for lower in self._exporters(plan, joint)]:
             return (
-                "which it commands itself: it gets its value of the cycle before",
-                f"read the state, {joint}/{name}, or remove it",
+                "its own command of the previous cycle",
+                f"read the state {joint}/{name}, or remove this entry",
             )
         return None
 
@@ -229,10 +226,10 @@ class ControllerGraph:
         for index, target in enumerate(plan.into):
             at = (*_path(name), "into", index)
             if target == name:
-                yield Mistake(at, f"`into` of {name} names {name} itself", "name the controller below it")
+                yield Mistake(at, f"`into` of {name} names {name} itself", "name another controller")
             elif target not in self._named:
                 known = tuple(one.name for one in self.controllers if one.reference and one.name != name)
-                what = f"`into` of {name} names {target}, which is not a controller of the robot"
+                what = f"`into` of {name} names an unknown controller {target}"
                 yield Mistake(at, what, suggestion(target, known or tuple(self._named)))
             elif target in plan.into[:index]:
                 yield Mistake(at, f"`into` of {name} names {target} twice", "name it once")
@@ -243,14 +240,14 @@ class ControllerGraph:
         if not plan.into or name in self._incomplete:
             return
         if not plan.command:
-            what = f"`into` of {name} names {_listed(plan.into)}, but {name} commands nothing"
-            yield Mistake((*_path(name), "into"), what, "remove `into`, or use a controller that commands")
+            what = f"`into` of {name} names {_listed(plan.into)}, but {name} has no commands"
+            yield Mistake((*_path(name), "into"), what, "remove `into`, or use another controller type")
             return
         mute = [
             one for one in lowers if not (one.reference and one.joints) and one.name not in self._incomplete
         ]
         for lower in mute:
-            what = f"`into` of {name} names {lower.name}, which exports no reference"
+            what = f"`into` of {name} names {lower.name}, but {lower.name} exports no reference"
             yield Mistake(self._at_into(plan, lower), what, self._exporting(plan))
         known = all(target in self._named and target not in self._incomplete for target in plan.into)
         useful = [one for one in lowers if one not in mute]
@@ -275,33 +272,39 @@ class ControllerGraph:
                 missing.append((index, joint))
         if missing:
             exported = dict.fromkeys(joint for one in lowers for joint in one.joints)
-            what = f"{name} commands {_names(missing)}, which {_listed(one.name for one in lowers)} "
-            what += "does not export" if len(lowers) == 1 else "do not export"
+            does = "does" if len(lowers) == 1 else "do"
+            what = (
+                f"{name} commands {_names(missing)}, but {_listed(one.name for one in lowers)} {does} not "
+                f"export {_it(missing)}"
+            )
             fix = f"remove {_it(missing)}; exported: {_listed(exported)}"
             yield Mistake(_joint(name, missing[0][0]), what, fix)
         for lower, joints in partial.items():
             exported_interfaces = self._named[lower].reference
             lacking = [each for each in plan.command if each not in exported_interfaces]
             what = (
-                f"{name} commands {' and '.join(lacking)} of {_names(joints)}, which {lower} does not export"
+                f"{name} commands {' and '.join(lacking)} of {_names(joints)}, but {lower} does not export "
+                f"{_it(lacking)}"
             )
-            fix = f"{lower} exports {' and '.join(exported_interfaces)}: let the two have the same interfaces"
+            fix = f"give both the same interfaces; {lower} exports {' and '.join(exported_interfaces)}"
             yield Mistake((*_path(name), "into", plan.into.index(lower)), what, fix)
         for pair, joints in double.items():
             what = f"{_names(joints)} of {name} is exported by {' and '.join(pair)}"
             yield Mistake(
-                _joint(name, joints[0][0]), what, "let one of them export it, or remove one from `into`"
+                _joint(name, joints[0][0]),
+                what,
+                "export each joint in one controller only, or remove one from `into`",
             )
         idle_ones = [one for one in lowers if one.name not in used and not missing]
         for idle in idle_ones:
-            what = f"`into` of {name} names {idle.name}, which exports none of its joints"
+            what = f"`into` of {name} names {idle.name}, but {idle.name} exports no joint of {name}"
             yield Mistake(self._at_into(plan, idle), what, f"remove {idle.name} from `into`")
 
     def _activity(self, plan: ControllerPlan) -> Iterator[Mistake]:
         """Check that a controller with `active: true` commands only controllers that are active too."""
         for lower in self._lowers(plan):
             if plan.active and not lower.active:
-                what = f"{plan.name} is active from the start, but {lower.name}, which it commands, is not"
+                what = f"{plan.name} commands {lower.name}, but only {plan.name} is active from the start"
                 fix = f"write active: true in {lower.name}, or active: false in {plan.name}"
                 yield Mistake(self._at_into(plan, lower), what, fix)
 
@@ -310,16 +313,13 @@ class ControllerGraph:
         for lower in self._lowers(plan):
             if plan.every and lower.every and plan.every % lower.every:
                 what = (
-                    f"{plan.name} is updated every {_cycles(plan.every)}, {lower.name}, which it commands, "
+                    f"the rate of {plan.name} (every {_cycles(plan.every)}) does not divide the rate of "
+                    f"{lower.name} (every {_cycles(lower.every)})"
                 )
-                what += f"every {_cycles(lower.every)}: its rate does not divide that of {lower.name}"
+                rate = f" ({lower.rate:g} Hz)" if lower.rate is not None else ""
+                fix = f"divide the rate of {lower.name}{rate} by a whole number"
                 key = "rate" if plan.rate is not None else "into"
-                yield Mistake(
-                    (*_path(plan.name), key),
-                    what,
-                    f"give {plan.name} the rate of {lower.name} or a whole fraction of that rate"
-                    + (f": {lower.rate:g}" if lower.rate is not None else ""),
-                )
+                yield Mistake((*_path(plan.name), key), what, fix)
 
     def _reads(self, plan: ControllerPlan) -> Iterator[Mistake]:
         """Check that each interface in `reads` exists; the missing ones of one source are one mistake."""
@@ -331,7 +331,7 @@ class ControllerGraph:
                 missing.setdefault(source, []).append(index)
         for source, indices in missing.items():
             interface = plan.reads[indices[0]]
-            more = f" and {len(indices) - 1} more of this source" if indices[1:] else ""
+            more = f" and {len(indices) - 1} more of {source}" if indices[1:] else ""
             what, fix = self._unreadable(interface, source, interface.rpartition("/")[2])
             at = (*_path(plan.name), "reads", indices[0])
             yield Mistake(at, f"{plan.name} reads {interface}{more}, but {what}", fix)
@@ -342,18 +342,18 @@ class ControllerGraph:
         plan = self._named.get(owner)
         if interface.count("/") not in {1, 2} or "" in interface.split("/"):
             return (
-                "that is not an interface",
+                f"{interface} is not an interface",
                 "write JOINT/position, or CONTROLLER/JOINT/position for a reference",
             )
         if source in self._readable:
             return f"{source} has no interface {name}", f"it has {', '.join(self._readable[source])}"
         if plan is None:
             if joint:
-                return f"there is no controller {owner}", suggestion(owner, tuple(self._named))
+                return f"{owner} is not a controller", suggestion(owner, tuple(self._named))
             providing = tuple(one.name for one in self.controllers if one.provides)
             known = (*self.joints, *(one.name for one in self.sources), *providing)
             kind = "joint, device, sensor or controller" if self.sources or providing else "joint"
-            return f"there is no {kind} {owner}", suggestion(owner, known)
+            return f"{owner} is not a {kind}", suggestion(owner, known)
         return _unexported(plan, joint)
 
     def _source_commands(self, plan: ControllerPlan) -> Iterator[Mistake]:
@@ -361,8 +361,8 @@ class ControllerGraph:
         known = [f"{one.name}/{command}" for one in self.sources for command in one.commands]
         for index, name in enumerate(plan.source_commands):
             if name not in known and name.partition("/")[0] not in self._incomplete:
-                what = f"{plan.name} commands {name}, which is not a command of a device"
-                fix = suggestion(name, known) if known else "name it under `commands` of the device"
+                what = f"{plan.name} commands {name}, but {name} is not a command of a device"
+                fix = suggestion(name, known) if known else "add it to `commands` of the device"
                 yield Mistake((*_path(plan.name), "source_commands", index), what, fix)
 
     def _takeovers(self, plan: ControllerPlan) -> Iterator[Mistake]:
@@ -373,13 +373,13 @@ class ControllerGraph:
             if name not in self._named:
                 others = [other for other in self._named if other != plan.name]
                 yield Mistake(
-                    at, f"{plan.name} activates {name}, which is not defined", suggestion(name, others)
+                    at, f"{plan.name} activates an unknown controller {name}", suggestion(name, others)
                 )
             elif name == plan.name:
                 yield Mistake(at, f"{name} activates itself", "name another controller")
         known = [self._named[name] for name in names if name in self._named and name not in self._incomplete]
         if found := conflicts_text(conflicts(known)):
-            what = f"{plan.name} activates what cannot be active together: {found}"
+            what = f"{plan.name} activates conflicting controllers: {found}"
             yield Mistake((*_path(plan.name), "takeovers", 0), what, "remove one of them")
 
     def _needed_together(self, plan: ControllerPlan) -> Iterator[Mistake]:
@@ -388,9 +388,11 @@ class ControllerGraph:
         for lower in self._lowers(plan):
             found = {pair: clash for pair, clash in found.items() if pair not in self._clashes_below(lower)}
         for (holder, other), clashes in found.items():
-            what = f"{plan.name} needs {self._way(plan, holder)} and {self._way(plan, other)} together, "
-            what += f"and both command {_claimed(clashes)}"
-            fix = "remove these joints from one of the two, or let one end in the other"
+            what = (
+                f"the chains {self._way(plan, holder)} and {self._way(plan, other)} both command "
+                f"{_claimed(clashes)}"
+            )
+            fix = "remove these joints from one chain, or join the chains by `into`"
             yield Mistake((*_path(plan.name), "into"), what, fix)
 
     def _clashes_below(self, plan: ControllerPlan) -> dict[tuple[str, str], list[Conflict]]:
@@ -424,8 +426,8 @@ class ControllerGraph:
             )
             what = f"controllers command each other in a circle: {drawn(circle)}"
             if not all(after in self._named[one].into for one, after in following.items()):
-                what = f"controllers wait for each other, by `into` and by `reads`: {drawn(circle)}"
-            yield Mistake(at, what, "remove one of these steps")
+                what = f"controllers depend on each other in a circle, by `into` and `reads`: {drawn(circle)}"
+            yield Mistake(at, what, "remove one of these links")
 
     def _active_claims(self) -> Iterator[Mistake]:
         """Check that no two controllers with `active: true` claim the same servo or reference."""
@@ -441,7 +443,7 @@ class ControllerGraph:
                 what += f" (chain{'s' * (len(ways) > 1)} {' and '.join(ways)})"
             joints = [joint for joint in dict.fromkeys(clash.joint for clash in clashes) if joint]
             of = f"joint{'s' * (len(joints) > 1)}" if joints else "device"
-            fix = f"write active: false in one of the two, or remove the {of}"
+            fix = f"write active: false in one controller, or remove the {of} from it"
             at = self._named[other].joints.index(joints[0]) if joints else None
             yield Mistake(_path(other) if at is None else _joint(other, at), what, fix)
 
@@ -464,13 +466,15 @@ class ControllerGraph:
             what = f"the fallback {plan.fallback} of {name} is not a controller of the robot"
             yield Mistake(at, what, suggestion(plan.fallback, tuple(self._named)))
         elif other is plan:
-            yield Mistake(at, f"{name} is its own fallback", "name another controller, or remove it")
+            yield Mistake(at, f"{name} is its own fallback", "name another controller, or remove `fallback`")
         elif name in below(self.controllers, other.name):
-            what = f"the fallback {other.name} of {name} commands {name} ({self._way(other, name)})"
-            yield Mistake(at, f"{what}, which has failed then", "name a controller that is not above it")
+            what = (
+                f"the fallback {other.name} of {name} commands the failed {name} ({self._way(other, name)})"
+            )
+            yield Mistake(at, what, f"name a controller independent of {name}")
         elif plan.active and other.active:
             what = f"the fallback {other.name} of {name} is active from the start"
-            fix = f"write active: false in {other.name}: it takes over later"
+            fix = f"write active: false in {other.name}"
             yield Mistake(at, what, fix)
         elif plan.active and not {name, other.name} & self._incomplete:
             yield from self._taking_over(plan, other, at)
@@ -490,9 +494,10 @@ class ControllerGraph:
         clashes = [one for one in conflicts(after) if one.other in entering and one.holder not in entering]
         for holder, other in dict.fromkeys((one.holder, one.other) for one in clashes):
             through = "" if other == fallback.name else f" through {other}"
-            what = f"fallback {fallback.name} of {plan.name} claims joints of {holder}{through}"
-            fix = "remove these joints from it, or name another controller"
-            yield Mistake(at, f"{what}, which stays active", fix)
+            what = (
+                f"the fallback {fallback.name} of {plan.name} claims joints of the active {holder}{through}"
+            )
+            yield Mistake(at, what, f"remove these joints from {other}, or name another controller")
 
     # Words
 
@@ -502,9 +507,9 @@ class ControllerGraph:
     def _exporting(self, plan: ControllerPlan) -> str:
         names = [one.name for one in self.controllers if one.reference and one.name != plan.name]
         return (
-            f"controllers that export: {_listed(names)}"
+            f"controllers with references: {_listed(names)}"
             if names
-            else "no controller of the robot exports any"
+            else "remove `into`; no controller of the robot exports references"
         )
 
 

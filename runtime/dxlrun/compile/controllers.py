@@ -40,8 +40,8 @@ from dxlwire.plan.mode_plan import LACKS, controls_speed, model_modes
 Made = TypeVar("Made")
 _INTERFACE: Mapping[Mode, str] = {
     Mode.POSITION: "a position",
-    Mode.VELOCITY: "a velocity alone",
-    Mode.EFFORT: "an effort alone",
+    Mode.VELOCITY: "a velocity",
+    Mode.EFFORT: "an effort",
     Mode.PWM: "a PWM",
     Mode.EFFORT_POSITION: "a position with an effort",
 }
@@ -57,15 +57,15 @@ def read_controller_files(file: RobotFile) -> dict[str, str]:
         mark, name = file.at("controllers", controller, "type"), file_of(entry.type)
         path = folder / (name or "")
         if name is None or path.resolve().parent != folder.resolve():
-            what = f"{entry.type} of {controller} is not a class of a file next to the robot file"
-            file.error(mark, what, "write ./wave.py:Wave for the class Wave of wave.py in the same folder")
+            what = f"{entry.type} of {controller} is not a class in the folder of the robot file"
+            file.error(mark, what, "write ./wave.py:Wave for the class Wave in wave.py")
             continue
         try:
             texts[name] = read_file(path).decode("utf-8")
         except (OSError, UnicodeDecodeError) as error:
-            why = error.strerror if isinstance(error, OSError) else "it is not UTF-8"
+            why = error.strerror if isinstance(error, OSError) else "not UTF-8"
             what = f"{name} of controller {controller} cannot be read ({why})"
-            file.error(mark, what, f"its place is {path}")
+            file.error(mark, what, f"check the file {path}")
     return texts
 
 
@@ -88,12 +88,12 @@ def compile_controllers(
     for name, joints in file.description.groups.items():
         own = compiled[name].plan if name in compiled else None
         if own is not None and own.command and set(own.joints) != set(joints):
-            what = f"group {name} has other joints than controller {name}, and both names mean joints"
+            what = f"group {name} and controller {name} have different joints"
             file.error(file.key("groups", name), what, "rename one of them")
     if len(file.robot.controllers) > MOST_CONTROLLERS:
         file.error(
             file.key("controllers"),
-            f"the file has {len(file.robot.controllers)} controllers, the most are {MOST_CONTROLLERS}",
+            f"the file has {len(file.robot.controllers)} controllers, more than {MOST_CONTROLLERS}",
             "remove some",
         )
     return compiled
@@ -117,7 +117,7 @@ def _compiled(file: RobotFile, plan: ControllerPlan, plugins: PlugIns) -> Compil
     buses = {f"/bus/{bus}" for bus in robot.buses}
     if found is not None and (taken := buses.intersection(found.plan.topics)):
         mark = file.key("controllers", name)
-        file.error(mark, f"{min(taken)} is the topic of a bus", f"call {name} otherwise")
+        file.error(mark, f"{min(taken)} is the topic of a bus", f"rename controller {name}")
     return found
 
 
@@ -218,7 +218,9 @@ def _every(file: RobotFile, name: str, rate: float | None) -> int:
         return every
     problem = "is above" if rate > loop else "does not divide"
     what = f"rate {rate:g} Hz of {name} {problem} the loop's {loop:g} Hz"
-    file.error(file.at("controllers", name, "rate"), what, f"the nearest possible is {loop / every:.6g}")
+    file.error(
+        file.at("controllers", name, "rate"), what, f"write the nearest possible rate, {loop / every:.6g}"
+    )
     return 0
 
 
@@ -269,9 +271,9 @@ def check_motions(
                 data = np.ascontiguousarray(cls.prepare("play", command, parameters), dtype="<f8")
                 seen.update(cls.speed_peaks("play", data, parameters))
         except Exception as error:  # foreign code; nothing else depends on these speeds
-            what = f"the speeds of its motions are not checked: {type(error).__name__}: {error}"
+            what = f"the speeds of its motions cannot be checked: {type(error).__name__}: {error}"
             text = f"controller {name} ({controller.offer.distribution}): {' '.join(what.split())}"
-            file.warning(file.key("controllers", name), text, "correct its parameters, or its plug-in")
+            file.warning(file.key("controllers", name), text, "correct the parameters, or the plug-in")
             continue
         told: set[tuple[str, str]] = set()
         for peak in sorted(seen, key=lambda peak: -abs(peak.speed)):
@@ -329,9 +331,9 @@ def _warn_of_slow_takeovers(
                 before, after = (one[joint].name.lower().replace("_", " ") for one in (modes, needed))
                 file.warning(
                     _graph_mark(file.description, named, ("controllers", plan.name, "takeovers", index)),
-                    f"when {plan.name} activates {name}, {joint}{more} must change from {before} to {after} "
-                    "mode, with torque off for some cycles",
-                    "let both command the same interfaces",
+                    f"when {plan.name} activates {name}, torque of {joint}{more} is off for some cycles "
+                    f"to change from {before} to {after} mode",
+                    "give all controllers of these joints the same interfaces",
                 )
 
 
@@ -349,9 +351,8 @@ def _check(
         at, rest = parted
         file.error(
             joint_mark(file.description, name, at),
-            f"{name} commands {_INTERFACE[mode]} of {at}, but not of {' and '.join(rest)}, which the same "
-            "servos move: a servo has one mode",
-            f"let {name} command {' and '.join(rest)} too, or positions",
+            f"{name} commands {_INTERFACE[mode]} of {at} only, but the same servos move {' and '.join(rest)}",
+            f"command {' and '.join(rest)} in {name} too, or command positions",
         )
         return
     for joint in controller.plan.joints:
@@ -360,20 +361,20 @@ def _check(
         model, mark = joints[joint].table.model, joint_mark(file.description, name, joint)
         if mode not in able[joint]:
             *others, last = (_INTERFACE[each] for each in able[joint])
-            known = f"use a controller that commands {', '.join(others)}{' or ' * bool(others)}{last}"
+            known = f"command {', '.join(others)}{' or ' * bool(others)}{last}"
             lacks = joints[joint].drive.excluded.get(mode, f"{model} of {joint} {LACKS[mode]}")
             within_a_turn = model_modes(joints[joint].table, continuous=False)
             if mode is Mode.EFFORT_POSITION and mode in within_a_turn:
-                lacks = f"{joint} is continuous, for which it is not offered"
+                lacks = f"this is not possible for the continuous joint {joint}"
                 known = f"remove `continuous`, or {known}"
             elif mode is Mode.EFFORT_POSITION and (key := controller.asked_by.get("effort")):
                 mark = file.key("controllers", name, *key)
-                known = f"remove {key[-1]}, or use a model that has it"
+                known = f"remove {key[-1]}, or use another model"
             file.error(mark, f"{name} commands {_INTERFACE[mode]}, but {lacks}", known)
         elif mode is Mode.VELOCITY and not controls_speed(joints[joint].table):
             file.warning(
                 mark,
-                f"{model} of {joint} controls no speed in wheel mode: a velocity of {name} is taken for the "
-                "same fraction of full output, and a loaded servo turns slower",
-                "command its PWM, or use a model that controls its speed",
+                f"{model} of {joint} does not control speed in wheel mode: a velocity of {name} becomes a "
+                "share of full output, and load slows the servo down",
+                "command a PWM, or use a model with speed control",
             )

@@ -52,7 +52,7 @@ def _write(root: Path, path: Path, text: str) -> None:
     place = Path(path).resolve()
     if not place.is_relative_to(root):
         raise InputError(
-            f"the log has a file {path.name} outside of its robot's directory; it is not written"
+            f"file {path.name} of the log is outside of the robot's directory and is not written"
         )
     place.parent.mkdir(parents=True, exist_ok=True)
     place.write_text(text)
@@ -88,7 +88,7 @@ def replan_controller(
         raise InputError(f"{change}: {error}") from error
     changed = found.plan
     if changed.references != plan.references:
-        raise InputError(f"{change}: the controller would export other references than those of the log")
+        raise InputError(f"{change}: the exported references differ from the log")
     if changed.provides != plan.provides:
-        raise InputError(f"{change}: the controller would provide other states than those of the log")
+        raise InputError(f"{change}: the provided states differ from the log")
     return changed

@@ -100,7 +100,7 @@ def listed_samples(
         if samples and point.time <= samples[-1].t_ns:
             problems.error(
                 motion.marks.value(*path, "time"),
-                f"time {point.time / 1e9:g} s is not after that of the point before, "
+                f"time {point.time / 1e9:g} s is not after the time of the previous point, "
                 f"{samples[-1].t_ns / 1e9:g} s",
                 "sort the points by time",
             )
@@ -213,7 +213,7 @@ class Expression:
             raise ValueError(f"a function has the wrong number of arguments ({error})") from None
         except ValueError:
             raise ValueError(
-                "a function is not defined there (root or logarithm of a negative number)"
+                "a function is undefined (such as the root or logarithm of a negative number)"
             ) from None
         if not math.isfinite(value):
             raise ValueError("the value is not finite")
@@ -230,7 +230,7 @@ def _parse(text: str) -> ast.expr:
     except (SyntaxError, ValueError, RecursionError, MemoryError):
         raise ValueError("it is not an expression, or a bracket or sign is missing") from None
     if _depth(tree) > DEEPEST_FORMULA:
-        raise ValueError(f"more than {DEEPEST_FORMULA} operations stand inside each other; group long sums")
+        raise ValueError(f"more than {DEEPEST_FORMULA} operations are nested; group long sums")
     called = {id(node.func) for node in ast.walk(tree) if isinstance(node, ast.Call)}
     for node in ast.walk(tree):
         if id(node) not in called or not isinstance(node, ast.Name):
@@ -248,18 +248,18 @@ def _depth(tree: ast.AST) -> int:
 def _check(node: ast.AST) -> None:
     if isinstance(node, ast.operator | ast.unaryop):
         if type(node) not in _OPERATORS:
-            raise ValueError(f"it uses an operation that formulas do not have ({type(node).__name__})")
+            raise ValueError(f"it uses an unsupported operation ({type(node).__name__})")
     elif not isinstance(node, _NODES):
-        raise ValueError(f"it uses something that formulas do not have ({type(node).__name__})")
+        raise ValueError(f"it uses an unsupported expression ({type(node).__name__})")
     elif isinstance(node, ast.Constant):
         if isinstance(node.value, bool) or not isinstance(node.value, int | float):
             raise ValueError(f"{node.value!r} is not a real number")
     elif isinstance(node, ast.Call):
         if not isinstance(node.func, ast.Name):
-            raise ValueError("only a function's name may stand before a bracket; write 2 * (t), not 2(t)")
+            raise ValueError("an operator is missing before a bracket; write 2 * (t), not 2(t)")
         if node.func.id not in FUNCTIONS:
-            raise ValueError(f"unknown function {node.func.id}; there are {', '.join(sorted(FUNCTIONS))}")
+            raise ValueError(f"unknown function {node.func.id}; known: {', '.join(sorted(FUNCTIONS))}")
         if node.keywords:
             raise ValueError("functions take no named arguments")
     elif isinstance(node, ast.Name) and node.id not in ("t", "pi"):
-        raise ValueError(f"unknown name {node.id}; there are t (seconds) and pi")
+        raise ValueError(f"unknown name {node.id}; known: t (seconds) and pi")

@@ -124,9 +124,9 @@ def check_times(parts: Sequence[MotionPart], duration_ns: int | None, problems: 
             last = max(replaced, key=lambda one: one.motion_end_ns)
             problems.error(
                 part.mark,
-                f"{part.controller} gets this motion at {_seconds(part.start_ns)}, while it still plays that "
-                f"of {last.mark} until {_seconds(last.motion_end_ns)}",
-                f"write start: {_seconds(last.end_ns)}, or play them in two runs",
+                f"this motion of {part.controller} starts at {_seconds(part.start_ns)}, but the motion at "
+                f"{last.mark} ends at {_seconds(last.motion_end_ns)}",
+                f"write start: {_seconds(last.end_ns)}, or play the motions in two runs",
             )
     for part in parts:
         if duration_ns is not None and part.motion_end_ns > duration_ns:
@@ -162,7 +162,7 @@ def affordable(motion: MotionDescription, problems: Problems) -> bool:
             problems.error(
                 motion.marks.value("motions", longest, "samples"),
                 f"{motion.motion.name} has {total} {what}; {most} are allowed",
-                "lower samples: a trajectory controller goes smoothly from one to the next"
+                "lower samples: a trajectory controller interpolates between them"
                 if per_part is values
                 else "lower samples, or shorten the formulas",
             )
@@ -195,7 +195,7 @@ def _controller(
         problems.error(
             mark,
             f"controller {name} is not active at start",
-            "write active: true in the robot file, or choose an active one",
+            "write active: true in the robot file, or choose an active controller",
         )
         return None
     return controller
@@ -216,7 +216,7 @@ def playable(
     if kind is None:
         problems.error(
             motion.marks.value("motions", index, "controller"),
-            f"{controller.plan.name} ({controller.plan.type}) takes no commands that a motion could give",
+            f"{controller.plan.name} ({controller.plan.type}) cannot play motions",
             "choose a group controller or a trajectory controller",
         )
     if kind is None or not _right_units(motion, index, joints, problems):
@@ -264,7 +264,7 @@ def _right_units(
                 if value is not None and value.joint_unit is not unit:
                     problems.error(
                         motion.marks.value("motions", index, "points", number, "joints", joint, quantity),
-                        f"{joint} {unit.verb}, and its {quantity} is in {value.unit}",
+                        f"{joint} {unit.verb}, so its {quantity} cannot be in {value.unit}",
                         f"write {unit.shown} or {unit.si}, as in {_EXAMPLES[unit][quantity]}",
                     )
                     good = False
@@ -309,7 +309,7 @@ def warn_of_turns(
             problems.warning(
                 mark,
                 f"{joint} turns by {math.degrees(step):.4g} deg from one point to the next",
-                f"write wrap: true for {joint} if it shall take the shorter way",
+                f"write wrap: true for {joint} to take the shorter way",
             )
 
 
@@ -322,7 +322,7 @@ def warn_of_last_velocities(samples: Sequence[MotionSample], problems: Problems)
         if target.position is None and target.velocity:
             problems.warning(
                 target.mark,
-                f"the motion leaves {joint} moving, so it never reaches its goal",
+                f"{joint} still moves at the end of the motion and reaches no goal",
                 f"end with a velocity of 0 for {joint}",
             )
 
@@ -415,7 +415,7 @@ def speed_peaks(
     except Exception as error:
         reason = str(error) or type(error).__name__
         what = f"{controller.plan.name}: speed_peaks() failed: {reason}"
-        raise refusal(mark, what, f"report it to the author of {controller.offer.distribution}") from error
+        raise refusal(mark, what, f"report this to the author of {controller.offer.distribution}") from error
 
 
 def command_kind(controller: type[Controller[Any]]) -> str | None:
@@ -443,7 +443,7 @@ def group_command(
             if quantity not in quantities and target.value_of(quantity) is not None:
                 raise refusal(
                     target.mark,
-                    f"{joint} has a target {quantity}, which this controller does not take",
+                    f"{joint} has a target {quantity}, but this controller does not support it",
                     f"remove the {quantity}, or choose another controller",
                 )
     return {
@@ -483,7 +483,6 @@ def _value(sample: MotionSample, joint: str, quantity: Quantity) -> float:
         raise refusal(
             sample.mark if target is None else target.mark,
             f"{joint} has no target {quantity} at {sample.t_ns * 1e-9:g} s",
-            f"give it one; every joint of the controller needs its {quantity}, here or, "
-            "for a group controller, in a point before",
+            f"add the {quantity} here or, for a group controller, in an earlier point",
         )
     return value

@@ -37,8 +37,8 @@ def check_orientations(
         key = "imu_link" if model is not None and model.imu_link else "imu"
         file.warning(
             marks.value("model", key),
-            f"{imu} has the orientation of link {links[imu]}, but turns {frames.imu_link}, {turn}",
-            f"write `imu_link: {links[imu]}`, or the frame of {imu}",
+            f"the frame of {imu} is {links[imu]}, but its link is {frames.imu_link}: {turn}",
+            f"write `imu_link: {links[imu]}`, or correct the frame of {imu}",
         )
     if frames is not None and imu:
         links.setdefault(imu, frames.imu_link)
@@ -47,9 +47,9 @@ def check_orientations(
         if state and (turn := _turn(urdf, urdf.root, links.get(source, urdf.root))):
             file.warning(
                 marks.value("controllers", name, "orientation"),
-                f"{name} takes an orientation for that of the URDF's first link {urdf.root}, but {source} "
-                f"has that of {links[source]}, {turn}",
-                f"give it that of an IMU on {urdf.root}",
+                f"{name} uses the orientation of {links[source]} from {source} for the URDF's first link "
+                f"{urdf.root}: {turn}",
+                f"use the orientation of an IMU on {urdf.root}",
             )
 
 
@@ -60,15 +60,15 @@ def _check_frame(
     frame, source = _text(controller, "frame"), controller.plan.reads[0].partition("/")[0]
     mark = file.at("controllers", name, "frame")
     if frame not in urdf.links:
-        what = f"the messages of {name} have the frame {frame}, which is not a link of the URDF"
+        what = f"the frame {frame} of {name} is not a link of the URDF"
         file.warning(mark, what, suggestion(frame, urdf.links))
     elif links.get(source) in urdf.links:
         mounting = getattr(controller.parameters, "mounting", (0.0, 0.0, 0.0))
         if turn := _turn(urdf, frame, links[source], from_rpy(mounting)):
             file.warning(
                 mark,
-                f"the messages of {name} have the frame {frame}, but {source} is on {links[source]}, {turn}",
-                f"write `frame: {links[source]}`, or how it is turned there as `mounting`",
+                f"the frame of {name} is {frame}, but {source} is on {links[source]}: {turn}",
+                f"write `frame: {links[source]}`, or the rotation of {source} as `mounting`",
             )
 
 
@@ -84,14 +84,14 @@ def _turn(urdf: Urdf, link: str, other: str, expected: Quaternion = NO_TURN) -> 
         return ""
     (above, place), (other_above, other_place) = _fixed(urdf, link), _fixed(urdf, other)
     if above != other_above:
-        return "which moves against it"
+        return "these links move relative to each other"
     found = product(conjugate(place.rotation), other_place.rotation)
     # abs(): q and -q are the same rotation. min(): rounding may lead to more than 1.
     angle = 2 * math.acos(min(1.0, abs(product(conjugate(expected), found)[3])))
     if angle <= _ALIKE_RAD:
         return ""
-    mounting = " and its mounting" * (expected != NO_TURN)
-    return f"which is turned by {math.degrees(angle):.0f} deg against it{mounting}"
+    mounting = " with the mounting" * (expected != NO_TURN)
+    return f"these links differ by {math.degrees(angle):.0f} deg{mounting}"
 
 
 def _fixed(urdf: Urdf, link: str) -> tuple[str, Transform]:

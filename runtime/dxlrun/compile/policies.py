@@ -62,17 +62,18 @@ def _check_poses(file: RobotFile, joints: Mapping[str, CompiledJoint]) -> None:
         for joint, position in positions.items():
             if joint not in known:
                 mark = file.key("poses", pose, joint)
-                what = f"pose {pose} has joint {joint}, which is not defined"
+                what = f"joint {joint} of pose {pose} is not defined"
                 file.error(mark, what, suggestion(joint, known))
             elif joint in joints:
                 plan = joints[joint].plan
                 allowed, mark = limits_of(plan), file.at("poses", pose, joint)
                 if plan.unit is not position.joint_unit:
-                    what = f"{joint} {plan.unit.verb}, and pose {pose} has it in {position.unit}"
+                    what = f"{joint} {plan.unit.verb}, so pose {pose} cannot have it in {position.unit}"
                     file.error(mark, what, f"write it as {_EXAMPLES[plan.unit]}")
                 elif not allowed.contains(Interval(position, position)):
-                    what = f"pose {pose} puts {joint} at {plan.unit.text(position, trim=True)}"
-                    file.error(mark, what, f"it can go to {allowed}")
+                    at = plan.unit.text(position, trim=True)
+                    what = f"pose {pose} puts {joint} at {at}, outside its limits {allowed}"
+                    file.error(mark, what, "change the pose or the limits")
 
 
 def _policy(
@@ -94,13 +95,13 @@ def _policy(
             if angles is None:
                 mark = file.at(*mark_path)
                 known = tuple(file.robot.poses)
-                what = f"{name} has pose {step.pose}, which is not defined"
-                file.error(mark, what, suggestion(step.pose, known) if known else "write it in poses")
+                what = f"pose {step.pose} of {name} is not defined"
+                file.error(mark, what, suggestion(step.pose, known) if known else "add it to poses")
             else:
                 linear = [joint for joint in angles if joint in joints and joints[joint].plan.unit is LINEAR]
                 if linear and step.linear_speed is None:
                     mark = file.at("policies", name, index)
-                    what = f"{name} brings {linear[0]}, which is linear, to pose {step.pose} at no speed"
+                    what = f"pose {step.pose} of {name} has no speed for the linear joint {linear[0]}"
                     file.error(mark, what, "add linear_speed: 20 mm/s")
                 steps.append(_pose(step, angles, joints))
         else:
@@ -153,9 +154,9 @@ def _check_stopping(file: RobotFile, name: str, joints: Mapping[str, CompiledJoi
         if stop_s * 1e9 > left_ns:
             file.error(
                 file.at("joints", joint.name, "limits", "acceleration"),
-                f"{joint.name} may take {stop_s:.2g} s to stop before {name} holds it, but of "
-                f"exit_timeout {max(left_ns, 0) * 1e-9:.2g} s are left",
-                "raise exit_timeout, or allow more acceleration",
+                f"{joint.name} may take {stop_s:.2g} s to stop before {name} holds it, but "
+                f"{max(left_ns, 0) * 1e-9:.2g} s of exit_timeout are left",
+                "raise exit_timeout, or the acceleration limit",
             )
 
 
@@ -172,10 +173,10 @@ def _check_groups(file: RobotFile, joints: Mapping[str, CompiledJoint]) -> None:
         for index, joint in enumerate(own):
             mark = file.at(*at, "joints", index)
             if joint not in known:
-                what = f"group {name} has joint {joint}, which is not defined"
+                what = f"joint {joint} of group {name} is not defined"
                 file.error(mark, what, suggestion(joint, known))
             elif owner.setdefault(joint, name) != name or own.index(joint) < index:
-                file.error(mark, f"{joint} is in group {owner[joint]} already", "name each joint once")
+                file.error(mark, f"{joint} is already in group {owner[joint]}", "name each joint once")
         parted = {
             other
             for joint in own
@@ -186,8 +187,7 @@ def _check_groups(file: RobotFile, joints: Mapping[str, CompiledJoint]) -> None:
         if parted:
             file.error(
                 file.at(*at, "joints"),
-                f"group {name} has a joint of a transmission without {' and '.join(sorted(parted))}, which "
-                "the same servos move",
+                f"group {name} has joints of a transmission, but not {' and '.join(sorted(parted))}",
                 f"add {' and '.join(sorted(parted))}",
             )
 
@@ -205,7 +205,7 @@ def _too_long(file: RobotFile, policy: Policy, name: str, limit_ns: int) -> None
     file.error(
         file.at("policies", name),
         f"{name} may take {policy.longest_ns * 1e-9:.1f} s ({slowest.text}: up to "
-        f"{slowest.longest_ns * 1e-9:.1f} s{origin}), but of exit_timeout {timeout_ns * 1e-9:g} s it has "
+        f"{slowest.longest_ns * 1e-9:.1f} s{origin}), but exit_timeout {timeout_ns * 1e-9:g} s leaves "
         f"{max(limit_ns, 0) * 1e-9:.1f} s",
-        f"raise exit_timeout to {-(-needed_s * 10 // 1) / 10:g} s, or make its steps faster",
+        f"raise exit_timeout to {-(-needed_s * 10 // 1) / 10:g} s, or shorten its steps",
     )

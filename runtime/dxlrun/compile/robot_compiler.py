@@ -287,21 +287,21 @@ def _check_scheduler(file: RobotFile) -> None:
     if 1e9 / loop.rate >= timeout_ns:
         file.warning(
             file.at("loop", "rate"),
-            f"at {loop.rate:g} Hz the loop sees a request to stop up to {1 / loop.rate:.3g} s late; by then "
-            f"the guardian has ended it, because exit_timeout is {timeout_ns * 1e-9:g} s",
+            f"at {loop.rate:g} Hz the loop can stop up to {1 / loop.rate:.3g} s late, but the guardian ends "
+            f"it after exit_timeout ({timeout_ns * 1e-9:g} s)",
             "raise policies.exit_timeout, or the rate",
         )
     if scheduler.policy != "other" and scheduler.priority > _HIGHEST:
         file.warning(
             file.at("loop", "scheduler", "priority"),
-            f"the guardian needs a higher priority than {scheduler.priority}, and there is none",
-            f"write {_HIGHEST} at most",
+            f"no priority above {scheduler.priority} is left for the guardian",
+            f"write {_HIGHEST} or less",
         )
     if scheduler.polling != "auto" and scheduler.polling * MOST_SHARE > round(1e9 / loop.rate):
         file.error(
             file.at("loop", "scheduler", "polling"),
             f"polling {scheduler.polling / 1e6:g} ms is over half of the period, {1e3 / loop.rate:.3g} ms",
-            "write less, or auto",
+            "write a shorter time, or auto",
         )
 
 

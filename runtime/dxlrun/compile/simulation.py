@@ -43,10 +43,10 @@ if TYPE_CHECKING:
     from dxlwire.bus_plan import ServoPlan
 
 _MOVE: Mapping[JointUnit, str] = {ROTARY: "turn", LINEAR: "move"}
-NEEDS_MUJOCO = "physics: mujoco needs MuJoCo, which is not installed"
-INSTALL_MUJOCO = "`pip install 'dxlrun[physics]'` installs it; or take physics: independent"
-NEEDS_URDF = "physics: mujoco moves the bodies of a URDF, and the file names none"
-NAME_URDF = "write `model: {urdf: ...}`, or take physics: independent"
+NEEDS_MUJOCO = "MuJoCo, needed for physics: mujoco, is not installed"
+INSTALL_MUJOCO = "run `pip install 'dxlrun[physics]'`, or write physics: independent"
+NEEDS_URDF = "physics: mujoco needs a URDF"
+NAME_URDF = "write `model: {urdf: ...}`, or physics: independent"
 
 
 def compile_simulation(
@@ -117,8 +117,8 @@ def _check_load(file: RobotFile, name: str, joint: CompiledJoint, motor: MotorDe
     if keys.gravity_angle is not None and not _load(joint, motor).gravity:
         file.warning(
             file.at("joints", name, "simulation", "gravity_angle"),
-            f"gravity_angle is where the weight of {name} hangs down, but it has none",
-            "give its weight as `gravity: ... Nm`, or remove gravity_angle",
+            f"gravity_angle of {name} has no effect without gravity",
+            "add `gravity: ... Nm`, or remove gravity_angle",
         )
     stall, unit = _stall(joint), joint.plan.unit
     models = ", ".join(dict.fromkeys(servo.table.model for servo in joint.servos))
@@ -140,7 +140,7 @@ def _check_load(file: RobotFile, name: str, joint: CompiledJoint, motor: MotorDe
                 file.warning(
                     file.at("joints", name, "simulation", key),
                     f"with physics: mujoco the URDF defines the {key} of {name}",
-                    f"remove {key}; it counts only for joints that the URDF does not turn",
+                    f"remove {key}; it is for joints without motion in the URDF",
                 )
 
 
@@ -157,14 +157,14 @@ def _check_buses(file: RobotFile) -> None:
         if bus.simulation.absent == "slot" and bus.protocol == 1.0:
             file.warning(
                 file.at("buses", name, "simulation", "absent"),
-                f"absent: slot is for servos of Protocol 2.0, bus {name} speaks Protocol 1.0",
+                f"absent: slot is for Protocol 2.0, but bus {name} has Protocol 1.0",
                 "remove it",
             )
         if bus.simulation.echo and bus.port == SIMULATED:
             file.warning(
                 file.at("buses", name, "simulation", "echo"),
-                f"dxlrun does not run on an adapter that echoes, as bus {name} then does",
-                "echo is for other programs, through `dxlrun sim`; remove it",
+                f"dxlrun does not support the echo of bus {name}",
+                "remove echo; it is for other programs, through `dxlrun sim`",
             )
 
 

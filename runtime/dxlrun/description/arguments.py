@@ -26,7 +26,7 @@ _USE = re.compile(r"\$\$\{|\$\{([^{}]*)(\}?)")
 def _scalar(value: object) -> object:
     if isinstance(value, dict | list):
         raise validation_error(
-            "the default of an argument is one value", "write text, a number, true or false"
+            "the default of an argument must be one value", "write text, a number, true or false"
         )
     return value
 
@@ -66,17 +66,19 @@ class Arguments:
                 self._declare(name, entry)
         elif block is not None or marks.has(("arguments",)):
             self._problem(
-                ("arguments",), "arguments is not a mapping", "write port: {default: sim, help: ...} in it"
+                ("arguments",),
+                "arguments is not a mapping",
+                "write `arguments: {port: {default: sim, help: ...}}`",
             )
         for name in given:
             if name not in self._names:
-                what = f"{name}:={given[name]} was given, but the robot file has no argument {name!r}"
+                what = f"argument {name}:={given[name]} is not declared in the robot file"
                 self.problems.append(Problem(Mark(COMMAND_LINE), what, _suggestion(name, self._names)))
 
     def _declare(self, name: str, entry: object) -> None:
         path = ("arguments", name)
         if not _NAME.fullmatch(name):
-            self._problem(path, f"{name!r} is not a name of an argument", "use letters, digits and _")
+            self._problem(path, f"{name!r} is not a valid name of an argument", "use letters, digits and _")
         try:
             default = Argument.model_validate(entry).default
         except ValidationError as error:
@@ -107,7 +109,7 @@ class Arguments:
         if path[:1] == ("arguments",):
             if path[-1] == "help":
                 return literal(path, text, quoted)
-            return _unusable("an argument's default cannot use ${...}", "write the value itself")
+            return _unusable("the default of an argument cannot contain ${...}", "write the value")
         uses = [match for match in _USE.finditer(text) if match[0] != "$${"]
         wrong = tuple(problem for use in uses for problem in self._wrong(use))
         names = [use[1].strip() for use in uses]
@@ -122,16 +124,16 @@ class Arguments:
     def _wrong(self, use: re.Match[str]) -> list[tuple[str, str]]:
         name = use[1].strip()
         if not use[2]:
-            return [("a ${ is not closed", "write ${name}, or $${ for a plain ${")]
+            return [("${ has no closing }", "write ${name}, or $${ for a literal ${")]
         if name in self._names:
             return []
-        return [(f"there is no argument {name!r}", _suggestion(name, self._names))]
+        return [(f"argument {name!r} is not declared", _suggestion(name, self._names))]
 
 
 def refuse_arguments(path: KeyPath, text: str, quoted: bool) -> FilledScalar:
     """Return the value of a scalar in a file without arguments, as a motion file: `${` is a problem."""
     if "${" in text:
-        return _unusable("this file takes no arguments", "write the value itself")
+        return _unusable("this file cannot contain ${...}", "write the value")
     return literal(path, text, quoted)
 
 
@@ -141,5 +143,5 @@ def _unusable(what: str, fix: str) -> FilledScalar:
 
 def _suggestion(name: str, known: Sequence[str]) -> str:
     if not known:
-        return "remove it, or declare it: arguments: {NAME: {default: ..., help: ...}}"
-    return suggestion(name, known, f"the arguments are {', '.join(known)}")
+        return "remove it, or declare it: `arguments: {NAME: {default: ..., help: ...}}`"
+    return suggestion(name, known, f"known arguments: {', '.join(known)}")

@@ -37,7 +37,7 @@ def _name(value: str) -> str:
     # Names become topics of the log and interfaces `<joint>/<interface>`.
     if not _NAME.fullmatch(value):
         raise validation_error(
-            f"{value!r} is not a name", _name_fix(re.sub(r"\W+", "_", value.strip(), flags=re.ASCII))
+            f"{value!r} is not a valid name", _name_fix(re.sub(r"\W+", "_", value.strip(), flags=re.ASCII))
         )
     return value
 
@@ -46,7 +46,7 @@ def _item_name(value: str) -> str:
     if not _NAME.fullmatch(value) or value != folded(value):
         short = folded(value).removeprefix("k").removesuffix("_gain")
         meant = f"position_{short}_gain" if short in ("p", "i", "d") else folded(value)
-        raise validation_error(f"{value!r} is not the name of an item", _name_fix(meant))
+        raise validation_error(f"{value!r} is not a valid name of an item", _name_fix(meant))
     return value
 
 

@@ -22,19 +22,19 @@ _LONGEST_BOOT_NS = 10_000_000_000
 
 def _protocol(value: float) -> float:
     if value not in (1.0, 2.0):
-        raise validation_error(f"there is no Protocol {value:g}", "write 1.0 or 2.0")
+        raise validation_error(f"Protocol {value:g} does not exist", "write 1.0 or 2.0")
     return value
 
 
 def _timer(value: int) -> int:
     if value > _LONGEST_TIMER_NS:
-        raise validation_error("an adapter does not buffer bytes for that long", "write 255 ms at most")
+        raise validation_error("an adapter buffers bytes for 255 ms at most", "write 255 ms or less")
     return value
 
 
 def _boot_time(value: int) -> int:
     if value > _LONGEST_BOOT_NS:
-        raise validation_error("a board does not boot for that long", "write 10 s at most")
+        raise validation_error("the boot time of a board is 10 s at most", "write 10 s or less")
     return value
 
 
@@ -46,8 +46,8 @@ class Adapter(Form):
     """Form of `adapter` of a bus: the USB or UART adapter between computer and servos."""
 
     kind: Literal["ftdi", "direct"] | None = key(
-        "Kind of adapter: an FTDI chip with its latency timer at 1 ms, or an adapter that delivers "
-        "bytes at once (direct).",
+        "Kind of adapter: with an FTDI chip and a latency timer of 1 ms (ftdi), or without a latency "
+        "timer (direct).",
         "direct",
         None,
     )
@@ -58,13 +58,12 @@ class Adapter(Form):
         16_000_000,
     )
     rs485: bool = key(
-        "Direction switching by the kernel (TIOCSRS485), for an RS-485 transceiver at a UART.",
+        "Direction switching by the kernel (TIOCSRS485), for an RS-485 transceiver on a UART.",
         "true",
         False,
     )
     boot_time: Annotated[Duration, AfterValidator(_boot_time)] = key(
-        "Boot time, at most 10 s, of a board that resets when its port is first opened after it was "
-        "plugged in.",
+        "Boot time, at most 10 s, of a board that resets the first time its port is opened.",
         "2 s",
         0,
     )

@@ -101,7 +101,7 @@ def read_file(path: Path) -> bytes:
     """
     folder = _folder.get()
     if folder is not None and not path.resolve().is_relative_to(folder):
-        raise PermissionError(errno.EACCES, "it is outside of the folder that may be read", str(path))
+        raise PermissionError(errno.EACCES, "it is outside the permitted folder", str(path))
     with open(path, "rb", opener=_opened) as stream:
         # One byte more shows that a file is too large, without reading the rest.
         data = stream.read(LARGEST_FILE + 1)
@@ -146,7 +146,9 @@ def read_text(path: Path, language: str = "YAML") -> str:
     try:
         data = read_file(path)
     except FileNotFoundError:
-        raise refusal(Mark(file), "there is no such file", "check the path; it counts from here") from None
+        raise refusal(
+            Mark(file), "file not found", "check the path, relative to the current directory"
+        ) from None
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
         number = error.errno if isinstance(error, OSError) else None
         reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
@@ -154,7 +156,7 @@ def read_text(path: Path, language: str = "YAML") -> str:
             raise refusal(Mark(file), reason, f"name a {language} file") from None
         if number == errno.EFBIG:
             raise refusal(Mark(file), reason, "split it, or shorten it") from None
-        what, fix = f"the file cannot be read ({reason})", "check its name and its rights"
+        what, fix = f"the file cannot be read ({reason})", "check its name and permissions"
         raise refusal(Mark(file), what, fix) from None
     if language == "YAML" and (kind := kind_of_bytes(data, path)):
         raise refusal(Mark(file), *kind)
@@ -173,7 +175,7 @@ def _decoded(data: bytes, file: str, language: str) -> str:
         what = f"the byte 0x{error.object[error.start]:02x} is not UTF-8"
         raise refusal(_mark_at(before, len(before), file), what, "save the file as UTF-8") from None
     if found := Reader.NON_PRINTABLE.search(text):
-        what = f"the character U+{ord(found[0]):04X} cannot stand in {language}"
+        what = f"the character U+{ord(found[0]):04X} is not allowed in {language}"
         raise refusal(_mark_at(text, found.start(), file), what, "remove it")
     return text
 
@@ -206,7 +208,7 @@ def _refused_tags(text: str, file: str) -> Iterator[Problem]:
         elif isinstance(event, yaml.CollectionStartEvent):
             depth += 1
             if depth > DEEPEST:
-                raise refusal(mark, f"this is nested deeper than {DEEPEST} levels", "make it flatter")
+                raise refusal(mark, f"this is nested deeper than {DEEPEST} levels", "reduce the nesting")
         elif isinstance(event, yaml.CollectionEndEvent):
             depth -= 1
         if isinstance(event, yaml.NodeEvent):
@@ -254,9 +256,9 @@ def _explained(error: yaml.MarkedYAMLError, text: str, file: str) -> Problem:
     line = (text.splitlines() or [""])[min(mark.line, len(text.splitlines())) - 1] if text else ""
     character = line[mark.column - 1 : mark.column]
     if "expected ',' or" in reported and line[: mark.column - 1].endswith("$"):
-        return Problem(mark, "${...} stands inside { } or [ ] without quotes", 'put it in quotes: "${name}"')
+        return Problem(mark, "${...} inside { } or [ ] has no quotes", 'write "${name}"')
     if "cannot start any token" in reported and character == "\t":
-        return Problem(mark, "there is a tab in the indentation", "indent with spaces")
+        return Problem(mark, "the indentation contains a tab", "indent with spaces")
     for part, what, fix in _WORDS:
         if part in reported:
             return Problem(mark, what.format(since=since, character=character), fix)
@@ -264,32 +266,32 @@ def _explained(error: yaml.MarkedYAMLError, text: str, file: str) -> Problem:
 
 
 _WORDS = (
-    ("cannot start any token", "a value cannot start with {character}", "put it in quotes"),
+    ("cannot start any token", "a value cannot start with {character}", "put the value in quotes"),
     (
         "mapping values are not allowed",
-        "there is a ':' where none can be",
-        "indent the keys of a mapping alike, and put a text with ': ' in quotes",
+        "this ':' is not allowed here",
+        "indent all keys of a mapping equally, and put text with ': ' in quotes",
     ),
-    ("unexpected ':'", "a ':' stands where none can be", "write `key: value` with a space after the ':'"),
-    ("entries are not allowed", "a list cannot start here", "start it on a new line, or write [a, b]"),
-    ("unexpected end of stream", "a quote is opened here and never closed", "close it"),
-    ("expected ',' or", "a comma is missing before this, in the brackets{since}", "add it"),
+    ("unexpected ':'", "this ':' is not allowed here", "write `key: value` with a space after the ':'"),
+    ("entries are not allowed", "a list cannot start here", "start the list on a new line, or write [a, b]"),
+    ("unexpected end of stream", "this quote is not closed", "close it"),
+    ("expected ',' or", "a comma is missing here, inside the brackets{since}", "add it"),
     ("could not find expected ':'", "a key has no ':'", "write `key: value`"),
     (
         "expected key",
-        "this line is indented unlike the lines that it belongs to",
-        "indent it like its neighbours",
+        "this line does not match the indentation above",
+        "use the same indentation",
     ),
     ("'-' indicator", "this line does not belong to the list above it", "start it with '- ', or indent it"),
     (
         "block end",
-        "this line is indented unlike the lines that it belongs to",
-        "indent it like its neighbours",
+        "this line does not match the indentation above",
+        "use the same indentation",
     ),
-    ("undefined alias", "this alias names no anchor above it", "write the value itself"),
-    ("duplicate anchor", "this anchor was given before", "give it another name"),
-    ("node content", "a value is missing here", "write one, or put the character in quotes"),
-    ("unknown escape", "a backslash stands before a character that it does not change", "use single quotes"),
+    ("undefined alias", "the anchor of this alias is not defined above", "write the value"),
+    ("duplicate anchor", "this anchor is already defined", "rename it"),
+    ("node content", "a value is missing here", "write a value, or put the character in quotes"),
+    ("unknown escape", "this is not an escape sequence of YAML", "use single quotes"),
 )
 
 
@@ -355,7 +357,7 @@ class _Grower:
             return self._problems
         more = len(self._merge_keys) - 1
         what = f"the merge key << is not YAML 1.2{f' (and {more} more)' * bool(more)}"
-        fix = "write what joints share into joint_defaults or groups, and parts of files into an include"
+        fix = "put shared keys of joints in joint_defaults or groups, and shared sections in an include"
         return [*self._problems, Problem(self._merge_keys[0], what, fix)]
 
     def value(self, node: yaml.Node, path: KeyPath) -> object:
@@ -379,7 +381,7 @@ class _Grower:
             here = (*path, key)
             mark = node_mark(key_node, self._file)
             if key in result:
-                what = f"{'.'.join(map(str, here))} was already given in line {self.keys[here].line}"
+                what = f"{'.'.join(map(str, here))} is already defined in line {self.keys[here].line}"
                 self._problems.append(Problem(mark, what, "keep one of the two"))
                 continue
             self.keys[here] = mark
@@ -391,9 +393,9 @@ class _Grower:
         self._nodes += 1
         if len(path) > DEEPEST:
             what = f"this is nested deeper than {DEEPEST} levels, or an anchor contains itself"
-            raise refusal(mark, what, "make it flatter")
+            raise refusal(mark, what, "reduce the nesting")
         if self._nodes > MOST_NODES:
-            what = f"the file has more than {MOST_NODES} values when its anchors are put in"
+            what = f"the file has more than {MOST_NODES} values after its aliases are expanded"
             raise refusal(mark, what, "write fewer")
         self.values[path] = mark
         if mark in self._tagged:
@@ -404,7 +406,7 @@ class _Grower:
         mark = node_mark(node, self._file)
         if not isinstance(node, yaml.ScalarNode):
             self._problems.append(
-                Problem(mark, "a mapping or a list cannot be a key", "write a word before the ':'")
+                Problem(mark, "a mapping or a list cannot be a key", "write a name before the ':'")
             )
             return None
         if node.value == "<<" and not _quoted(node):
@@ -413,10 +415,10 @@ class _Grower:
                 self.unknown.add(path)  # the merged keys are missing in it
             return None
         if not node.value:
-            self._problems.append(Problem(mark, "a key is empty", "write a word before the ':'"))
+            self._problems.append(Problem(mark, "a key is empty", "write a name before the ':'"))
             return None
         if "${" in node.value:
-            self._problems.append(Problem(mark, "arguments are not put into keys", "write the key out"))
+            self._problems.append(Problem(mark, "a key cannot contain ${...}", "write the key"))
             return None
         return str(node.value)
 

@@ -358,7 +358,7 @@ _TYPES: Mapping[str, str] = {
     "int_type": _WHOLE,
     "int_parsing": _WHOLE,
     "int_from_float": _WHOLE,
-    "int_parsing_size": "a whole number of ordinary size",
+    "int_parsing_size": "a whole number with fewer digits",
     "float_type": _NUMBER,
     "float_parsing": _NUMBER,
     "finite_number": "a finite number",
@@ -387,7 +387,7 @@ _BOUNDS: Mapping[str, str] = {
     "enum": "{expected}",
 }
 _REMEDIES: Mapping[str, str] = {
-    _WHOLE: "write digits only, without quotes and without a point",
+    _WHOLE: "write digits only, without quotes or a decimal point",
     _NUMBER: "write a number without quotes",
     _BOOL: "write true or false without quotes (yes, no, on and off are text)",
     _TEXT: "put it in quotes",
@@ -439,8 +439,8 @@ def _indentation(error: _Error) -> str:
     """Return the fix for a mapping that is indented wrongly or is a list; empty if it is neither."""
     if error.unindented:
         *others, last = error.unindented
-        named = f"{', '.join(others)} and {last} are keys" if others else f"{last} is a key"
-        return f"{named} of an entry: indent {'them' if others else 'it'} below the entry's name"
+        named = f"{', '.join(others)} and {last}" if others else last
+        return f"indent {named} below the name of an entry"
     if isinstance(error.input, list) and error.input and all(isinstance(one, dict) for one in error.input):
         names = [one.get("name", "NAME") for one in error.input]
         return f"write `{names[0]}: {{...}}` for each entry, without `-` before it"
@@ -463,7 +463,7 @@ def _sentence_missing(error: _Error) -> tuple[str, str]:
     key = error.path[-1]
     parent = path_text(error.path[:-1])
     if isinstance(key, int):
-        return f"{parent} has too few values", "add the others"
+        return f"{parent} has too few values", "add the missing ones"
     return f"{parent} has no {key}", f"add `{key}: {error.example or '...'}`"
 
 
@@ -473,7 +473,7 @@ def _sentence_unknown(error: _Error) -> tuple[str, str]:
     if len(error.location) == 1:
         known = (*known, *error.beside)
     if key in refused:
-        return f"{path_text(error.path)} is not possible", refused[key]
+        return f"{path_text(error.path)} is not allowed here", refused[key]
     if why := broken_features().get(key):
         what, _, fix = why.rpartition("; ")
         return what, fix
@@ -488,7 +488,8 @@ def _sentence_unknown(error: _Error) -> tuple[str, str]:
 def _sentence_length(error: _Error) -> tuple[str, str]:
     least, most = error.context.get("min_length"), error.context.get("max_length")
     if error.kind in ("too_long", "string_too_long"):
-        return f"{error.path_name} is too long", f"keep {most} at most"
+        counted = "entries" if error.kind == "too_long" else "characters"
+        return f"{error.path_name} is too long", f"write at most {most} {counted}"
     if error.kind == "string_too_short":
         return f"{error.path_name} is too short", "write something"
     return f"{error.path_name} has too few entries", f"write at least {least}"
@@ -499,7 +500,7 @@ def _sentence_own(error: _Error) -> tuple[str, str]:
     if "what" in error.context and "fix" in error.context:
         what, fix = str(error.context["what"]), str(error.context["fix"])
     else:
-        what, _, fix = str(error.context.get("error", "it is refused")).partition("; ")
+        what, _, fix = str(error.context.get("error", "the value is refused")).partition("; ")
     return f"{error.path_name}: {what}", fix or "correct it"
 
 
@@ -509,7 +510,7 @@ def _sentence_json(error: _Error) -> tuple[str, str]:
 
 def _sentence_pattern(error: _Error) -> tuple[str, str]:
     pattern = error.context.get("pattern")
-    return f"{error.path_name} is {format_value(error.input)}, which does not match {pattern}", "correct it"
+    return f"{error.path_name} is {format_value(error.input)}, but must match {pattern}", "correct it"
 
 
 _SENTENCES: Mapping[str, Callable[[_Error], tuple[str, str]]] = {

@@ -96,10 +96,12 @@ class _Collector:
             mark = marks.value(KEY, index)
             if not isinstance(entry, str) or not entry:
                 self._refuse(
-                    mark, f"include[{index}] is {format_value(entry)}, but must be a file's name", "name it"
+                    mark,
+                    f"include[{index}] is {format_value(entry)}, but must be a file name",
+                    "write a file name",
                 )
             elif "${" in entry:
-                self._refuse(mark, "arguments are not put into include", "write the file's name itself")
+                self._refuse(mark, "include cannot contain ${...}", "write the file name")
             else:
                 found.append((entry, mark))
         return found
@@ -113,12 +115,16 @@ class _Collector:
         elif place in self._done:
             return
         elif len(above) >= MOST_LEVELS:
-            self._refuse(mark, f"includes go deeper than {MOST_LEVELS} files", "include it further up")
+            self._refuse(
+                mark,
+                f"includes are nested deeper than {MOST_LEVELS} files",
+                f"include {entry} in the robot file",
+            )
         elif len(self._done) >= MOST_FILES:
-            self._refuse(mark, f"more than {MOST_FILES} files are included", "put some of them together")
+            self._refuse(mark, f"more than {MOST_FILES} files are included", "merge some of them")
         elif not fragment.exists():
             fix = "check the name; it is relative to the folder of this file"
-            self._refuse(mark, f"there is no file {entry}", fix)
+            self._refuse(mark, f"file {entry} not found", fix)
         else:
             self._read_fragment(fragment, entry, mark, above)
 
@@ -132,8 +138,8 @@ class _Collector:
                 self._refuse(mark if at_file else problem.mark, what, problem.fix)
             return
         if self._characters + len(text) > LARGEST_FILE:
-            what = f"with {entry} the robot has more than {LARGEST_FILE // 1024} KiB"
-            self._refuse(mark, what, "shorten it")
+            what = f"with {entry} the robot file is larger than {LARGEST_FILE // 1024} KiB"
+            self._refuse(mark, what, "shorten one of its files")
             return
         try:
             self.add_file(fragment, text, parse(text, str(fragment)), above)

@@ -76,11 +76,11 @@ class PointsPart(Form):
 
     refused: ClassVar[Mapping[str, str]] = dict.fromkeys(
         ("duration", "samples", "joints"),
-        "a part has either points, or duration, samples and joints; remove one of the two",
+        "write either points, or duration, samples and joints",
     )
 
     controller: str = key("Name of the controller.", "head", min_length=1)
-    start: Duration = key("Start of the part, as time since the loop's first deadline.", "1 s", 0)
+    start: Duration = key("Start of the part, as time since the first cycle of the loop.", "1 s", 0)
     points: Annotated[tuple[Point, ...], Field(strict=False)] = key(
         "Points in ascending order of time.", "[{time: 0 s, joints: ...}]", min_length=1
     )
@@ -90,7 +90,7 @@ class FormulaPart(Form):
     """Form of a part of a motion with formulas, for one controller; they are sampled before the run."""
 
     controller: str = key("Name of the controller.", "head", min_length=1)
-    start: Duration = key("Start of the part, as time since the loop's first deadline.", "1 s", 0)
+    start: Duration = key("Start of the part, as time since the first cycle of the loop.", "1 s", 0)
     duration: Annotated[Duration, Field(gt=0)] = key("Duration of the part.", "20 s")
     samples: int = key(
         "Number of points, with one at the start and one at the end of the part.", "500", ge=2, le=1_000_000
@@ -163,7 +163,7 @@ def parse_motion(text: str, path: Path, groups: Groups = NO_GROUPS) -> MotionDes
     grown = put_in(grow(parse(text, file), file, refuse_arguments), groups)
     if "motions" not in grown.data and {"buses", "joints"} & grown.data.keys():
         fix = f"run it with `dxlrun {path}`, and give --play a motion file"
-        raise refusal(grown.marks.value(), "this is a robot file, and no motion", fix)
+        raise refusal(grown.marks.value(), "this is a robot file, not a motion", fix)
     if "motions" not in grown.data and (kind := kind_of_data(grown.data, path)):
         raise refusal(grown.marks.value(), *kind)
     return MotionDescription(read_form(grown, MotionForm), grown.marks, path, text)

@@ -92,7 +92,7 @@ def _refuse_other_files(source: Source) -> None:
         return
     for key, (called, fix) in _OTHER_FILES.items():
         if key in data:
-            problem = f"this is a {called} file, and no robot"
+            problem = f"this is a {called} file, not a robot file"
             raise refusal(marks.key(key), problem, fix.format(path=source.path))
 
 

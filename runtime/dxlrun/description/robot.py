@@ -43,7 +43,7 @@ def _one_or_more(value: object) -> object:
     if isinstance(value, str):
         return (value,)
     if not isinstance(value, list) or not value:
-        raise validation_error("this names no controller", "write one name, or several: [a, b]")
+        raise validation_error("this is not the name of a controller", "write a name, or a list: [a, b]")
     return tuple(value)
 
 
@@ -171,7 +171,7 @@ class GroupPolicies(Form):
         (),
     )
     on_returned_servo: Word | None = key(
-        "State of a servo of the group that answers again after a reboot; the robot's policy by default.",
+        "State of a servo that answers again after a reboot; the robot's policy by default.",
         "hold",
         None,
     )
@@ -279,8 +279,7 @@ class RobotModel(Form):
         None,
     )
     imu_link: str | None = key(
-        "URDF link on which the IMU is mounted; NAME, NAME_link or NAME_frame by default, where NAME "
-        "is the value of `imu`.",
+        "URDF link of the IMU; by default the value of `imu`, alone or followed by _link or _frame.",
         "torso",
         None,
         min_length=1,

@@ -93,7 +93,7 @@ class Quantity:
         if not self._least <= value <= self._most:
             raise validation_error(
                 f"{text!r} is not {self.what} from {self._least:.0%} to {self._most:.0%}",
-                f"write one such as {self.examples}",
+                f"write {self.what} such as {self.examples}",
             )
         return value
 
@@ -136,7 +136,7 @@ class AlternativeQuantity(Quantity):
         number, unit = split(text, self.what, self.units, self.examples)
         value = float(number) * self.units[unit]
         if self._above_zero and not 0 < value < math.inf:
-            raise validation_error(f"{text!r} is not above 0", f"write one such as {self.examples}")
+            raise validation_error(f"{text!r} is not above 0", f"write {self.what} such as {self.examples}")
         if not math.isfinite(value):
             raise validation_error(f"{text!r} is too large", f"write {self.what} such as {self.examples}")
         return Measure(value, self._kinds[unit].si)
@@ -165,7 +165,9 @@ class UnlimitedQuantity(AlternativeQuantity):
             return text if isinstance(text, Measure) else Measure(math.inf, "")
         found = super().__call__(text)
         if not found > 0:
-            raise validation_error(f"{text!r} is not above 0", f"write one such as {self.examples}, or inf")
+            raise validation_error(
+                f"{text!r} is not above 0", f"write {self.what} such as {self.examples}, or inf"
+            )
         return found
 
     def format_value(self, value: float) -> str:
@@ -223,9 +225,7 @@ resistance = Quantity("a resistance", "ohm", {"ohm": 1.0, "mohm": 1e-3}, "3.6 oh
 viscous_friction = Quantity(
     "a viscous friction", "Nm s/rad", {"Nm s/rad": 1.0, "mNm s/rad": 1e-3}, "0.01 Nm s/rad"
 )
-stiffness = Quantity(
-    "a duty for each rad", "1/rad", {"1/rad": 1.0, "%/rad": 1e-2}, "0.158 1/rad or 15.8 %/rad"
-)
+stiffness = Quantity("a duty per rad", "1/rad", {"1/rad": 1.0, "%/rad": 1e-2}, "0.158 1/rad or 15.8 %/rad")
 share = Quantity("a share", "1", {"%": 1e-2}, "5 %", least=0.0, most=1.0)
 current = Quantity("a current", "A", {"A": 1.0, "mA": 1e-3}, "800 mA")
 temperature = Quantity("a temperature", "degC", {"degC": 1.0}, "70 degC")
@@ -263,7 +263,7 @@ def duration(text: object, *, bare: str = "") -> int:
     value = nanoseconds(number, unit)
     if value is None:
         raise validation_error(
-            f"{text!r} is not a duration from 0 s to 31 years", f"write one such as {written}"
+            f"{text!r} is not a duration from 0 s to 31 years", f"write a duration such as {written}"
         )
     return value
 
@@ -297,8 +297,8 @@ def split(
     if not unit:
         raise validation_error(f"{text!r} has no unit", f"write {what} with its unit, such as {written}")
     if unit not in units:
-        fix = _meant(text, units) or f"write it as {written}"
-        raise validation_error(f"{text!r} has the unit {unit}, which is not one of {what}", fix)
+        fix = _meant(text, units) or f"write {what} such as {written}"
+        raise validation_error(f"{text!r} has the wrong unit {unit} for {what}", fix)
     return number, unit
 
 
@@ -329,10 +329,12 @@ _UNIT_WORDS: Mapping[str, str] = {
 def _meant(text: str, units: Mapping[str, object]) -> str:
     """Return the fix for a quantity with a misspelled unit, or for two values; empty if none is known."""
     if several := list_text(text):
-        return f"these are two values, so write a list: {several}"
+        return f"write the two values as a list: {several}"
     match = re.fullmatch(r"([-+]?[0-9_.]+(?:[eE][-+]?\d+)?)\s*(\D.*)", text.strip())
     if match is None:
-        return "write the number: pi is 180 deg" if re.search(r"\bpi\b", text) and "deg" in units else ""
+        return (
+            "write a number, such as 180 deg for pi" if re.search(r"\bpi\b", text) and "deg" in units else ""
+        )
     powers = re.sub(r"([A-Za-z])\*{0,2}([23])$", r"\1^\2", match[2].replace("²", "^2").replace("³", "^3"))
     name, slash, divisor = powers.partition("/")
     base, power, exponent = divisor.partition("^")
@@ -390,19 +392,21 @@ def text_schema(example: str, units: Mapping[str, object]) -> dict[str, Any]:
 effort = AlternativeQuantity(
     "an effort", (torque, force, current, fraction), "0.3 Nm, 800 mA or 40 %", above_zero=True
 )
-position = AlternativeQuantity("an angle or a length", (angle, length), "60 deg, or 20 mm of a linear joint")
+position = AlternativeQuantity("an angle or a length", (angle, length), "60 deg, or 20 mm for a linear joint")
 speed = AlternativeQuantity(
-    "a velocity", (angular_velocity, linear_velocity), "2 rad/s, or 50 mm/s of a linear joint"
+    "a velocity", (angular_velocity, linear_velocity), "2 rad/s, or 50 mm/s for a linear joint"
 )
 acceleration = AlternativeQuantity(
-    "an acceleration", (angular_acceleration, linear_acceleration), "10 rad/s^2, or 1 m/s^2 of a linear joint"
+    "an acceleration",
+    (angular_acceleration, linear_acceleration),
+    "10 rad/s^2, or 1 m/s^2 for a linear joint",
 )
-tolerance = UnlimitedQuantity("a tolerance", (angle, length), "5 deg, or 5 mm of a linear joint")
+tolerance = UnlimitedQuantity("a tolerance", (angle, length), "5 deg, or 5 mm for a linear joint")
 rest_speed = UnlimitedQuantity(
-    "a speed at rest", (angular_velocity, linear_velocity), "5 deg/s, or 5 mm/s of a linear joint"
+    "a speed", (angular_velocity, linear_velocity), "5 deg/s, or 5 mm/s for a linear joint"
 )
 torque_or_force = AlternativeQuantity(
-    "a torque or a force", (torque, force), "0.3 Nm, or 2 N of a linear joint"
+    "a torque or a force", (torque, force), "0.3 Nm, or 2 N for a linear joint"
 )
 
 Angle = Annotated[float, angle]

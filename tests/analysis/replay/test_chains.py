@@ -236,7 +236,7 @@ def test_another_parameter_above_differs_first_in_its_references(story: Callable
 def test_other_references_than_those_of_the_log_are_refused(
     story: Callable[[str], Path], changed: Callable[..., Path]
 ) -> None:
-    with pytest.raises(InputError, match="base: the controller would export other references"):
+    with pytest.raises(InputError, match="base: the exported references differ"):
         replay_log(story("a restart"), [Setting.parse("base.exports=[position]")])
     other = plan(lambda content: content["loop"]["controllers"][1].update(reference=["position"]))
     with pytest.raises(LogError, match="the log is damaged: plan and cycles differ in references"):

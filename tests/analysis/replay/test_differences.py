@@ -119,7 +119,7 @@ def test_a_parameter_that_ends_the_replay_early(pair_log: Path) -> None:
         ("all_inputs.gain=much", "all_inputs.gain is the text 'much', but must be a number"),
         ("all_inputs.gain.low=1", "all_inputs.gain "),
         ("all_inputs.joints.low=1", "joints is not a mapping"),
-        ("all_inputs.joints=[tail]", "claims joint tail, which is not defined"),
+        ("all_inputs.joints=[tail]", "joint tail of all_inputs is not defined"),
         ("all_inputs.joints=[nod, nod]", "names joint nod twice"),
         ("all_inputs.gain=[", "is not YAML"),
         ("all_inputs.gain", "sets nothing"),
@@ -191,7 +191,7 @@ def test_a_file_outside_of_the_robots_directory_is_not_written(
     target = tmp_path / "written.yaml"
     outside = "/".join([".."] * 40) + str(target)
     log = changed(log_with_include, plan(lambda content: content["included"].update({outside: "name: x"})))
-    with pytest.raises(InputError, match="outside of its robot's directory"):
+    with pytest.raises(InputError, match="outside of the robot's directory"):
         replay_log(log, (), {"speed": "5 rad/s"})
     assert not target.exists()
 

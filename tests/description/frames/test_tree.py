@@ -117,10 +117,10 @@ def test_one_frame_is_seen_from_any_other(urdf: Urdf) -> None:
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        ({"of": "arn"}, "there is no frame arn; did you mean arm?"),
-        ({"of": "arm", "relative_to": "head"}, "there is no frame head; known: arm, base_link"),
-        ({"of": "arm", "positions": {"whel": 1.0}}, "there is no joint whel that moves; did you mean wheel?"),
-        ({"of": "arm", "positions": {"imu_mount": 1.0}}, "there is no joint imu_mount that moves"),
+        ({"of": "arn"}, "frame arn not found; did you mean arm?"),
+        ({"of": "arm", "relative_to": "head"}, "frame head not found; known: arm, base_link"),
+        ({"of": "arm", "positions": {"whel": 1.0}}, "movable joint whel not found; did you mean wheel?"),
+        ({"of": "arm", "positions": {"imu_mount": 1.0}}, "movable joint imu_mount not found"),
     ],
 )
 def test_an_unknown_name_is_refused(urdf: Urdf, words: dict[str, object], expected: str) -> None:
@@ -129,7 +129,7 @@ def test_an_unknown_name_is_refused(urdf: Urdf, words: dict[str, object], expect
 
 
 def test_a_pose_that_depends_on_an_unknown_position_is_refused(urdf: Urdf) -> None:
-    with pytest.raises(ValueError, match="a position is not known"):
+    with pytest.raises(ValueError, match="a position is missing"):
         FrameTree(urdf, SERVOS).pose("arm", positions={"arm": math.nan})
 
 
@@ -197,7 +197,12 @@ def test_what_hangs_from_the_imu_turns_with_it() -> None:
     ("imu", "right", "wrong", "expected"),
     [
         ("gyro", "", "", "the URDF has no link for the IMU gyro: gyro, gyro_link or gyro_frame"),
-        ("imu", '"base_link"', '"world"', "the URDF has a frame world, and the IMU's link imu_link"),
+        (
+            "imu",
+            '"base_link"',
+            '"world"',
+            "the URDF has a frame world, but no fixed joint from odom to the IMU's imu_link",
+        ),
     ],
 )
 def test_an_imu_that_fits_nowhere_is_refused(imu: str, right: str, wrong: str, expected: str) -> None:

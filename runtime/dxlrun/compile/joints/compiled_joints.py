@@ -191,9 +191,8 @@ def check_limp_joints(file: RobotFile, controllers: Iterable[ControllerPlan]) ->
         if limp and plan.active and plan.command and not plan.into:
             file.error(
                 file.key("controllers", plan.name),
-                f"controller {plan.name} is active from the start and commands {', '.join(limp)}, which has "
-                "torque: off",
-                f"write active: false, and `dxlrun torque on {' '.join(limp)}` before it is activated, or "
+                f"controller {plan.name} is active from the start, but torque is off for {', '.join(limp)}",
+                f"write active: false, and run `dxlrun torque on {' '.join(limp)}` before activating it, or "
                 "remove torque: off",
             )
 
@@ -220,7 +219,7 @@ def check_tolerances(
                 file.key("joints", name),
                 f"{name} sags {off} under its load, more than its tolerance of "
                 f"{degrees(plan.goal_tolerance)} deg",
-                "raise its P gain or its tolerance, or add a controller that carries the load",
+                "raise its P gain or its tolerance, or compensate the load in a controller",
             )
 
 
@@ -276,13 +275,13 @@ def _check_acceleration(file: RobotFile, plan: JointPlan) -> None:
     if seconds > MOST_STARTING_S:
         file.error(
             mark,
-            f"{plan.name} would need {seconds:.3g} s to reach {speed:.3g} {unit}, and as long to stop",
+            f"{plan.name} would need {seconds:.3g} s to reach {speed:.3g} {unit} or to stop",
             f"allow at least {speed / MOST_STARTING_S:.2g} {unit}^2",
         )
     elif seconds * rate <= 1:
         file.warning(
             mark,
-            f"{acceleration:.4g} {unit}^2 limits nothing: {plan.name} may reach its highest speed, "
+            f"{acceleration:.4g} {unit}^2 limits nothing: {plan.name} can reach its highest speed, "
             f"{speed:.3g} {unit}, within one cycle of {1e3 / rate:.3g} ms",
             f"write less than {speed * rate:.3g} {unit}^2, or remove it",
         )
@@ -307,13 +306,13 @@ def check_twins(file: RobotFile, tables: dict[str, ControlTable]) -> None:
         if abs(expected - right.reference) > _SAME:
             file.warning(
                 file.at("joints", twin, "reference"),
-                f"{twin} is not a mirror image of {name}: its reference is {degrees(right.reference)} deg, "
-                f"mirrored it would be {degrees(expected)} deg",
-                "correct one of the two references, or ignore this if the body is not symmetric there",
+                f"{twin} is not a mirror image of {name}: its reference is {degrees(right.reference)} deg "
+                f"instead of {degrees(expected)} deg",
+                "correct one reference, or ignore this for an asymmetric body",
             )
         if right.direction == left.direction:
             file.warning(
                 file.at("joints", twin, "direction"),
                 f"{twin} is not a mirror image of {name}: both have direction {left.direction:+d}",
-                f"write direction: {-left.direction:+d}, or ignore this if the body is not symmetric there",
+                f"write direction: {-left.direction:+d}, or ignore this for an asymmetric body",
             )

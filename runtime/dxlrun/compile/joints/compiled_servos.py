@@ -174,11 +174,11 @@ def check_bus(file: RobotFile, one: BusEntry, name: str, at: Callable[[str], Mar
     """Check an entry's bus and ID, add errors; return True if the bus exists. `at` returns places of keys."""
     bus = file.robot.buses.get(one.bus)
     if bus is None:
-        what = f"{name} is on bus {one.bus}, which is not defined"
+        what = f"bus {one.bus} of {name} is not defined"
         file.error(at("bus"), what, suggestion(one.bus, tuple(file.robot.buses)))
     elif one.id > bus.highest_id:
         what = f"{called} {one.id} of {name} is not valid in Protocol 2.0"
-        file.error(at("id"), what, f"give it one from 0 to {bus.highest_id}")
+        file.error(at("id"), what, f"write an ID from 0 to {bus.highest_id}")
     return bus is not None
 
 
@@ -195,14 +195,14 @@ def _assumed_model(file: RobotFile, servo: DescribedServo, others: list[Describe
     if servo.name != servo.title or servo.name not in file.robot.joints:
         file.error(
             mark,
-            f"{servo.title} ({servo.servo}) moves its joint with others, so its model cannot be auto",
-            f"write its model, such as {model}",
+            f"{servo.title} ({servo.servo}) shares its joint with other servos, so its model cannot be auto",
+            f"write the model, such as {model}",
         )
         return model
     file.warning(
         mark,
-        f"the servo of {servo.title} reports its model at the start; until then it is taken for an {model}",
-        "write its model to have reach and time checked for certain",
+        f"the model of {servo.title} is unknown until the start, and checked as {model}",
+        "write the model for reliable checks of range and time",
     )
     return model
 
@@ -216,13 +216,13 @@ def _table(file: RobotFile, servo: DescribedServo, model: str) -> ControlTable |
     except LookupError:
         protocols = protocols_of(model)
     if not protocols:
-        file.error(mark, f"no control table for model {model} of {name}", perhaps_meant(model, protocol))
+        file.error(mark, f"model {model} of {name} is unknown", perhaps_meant(model, protocol))
         return None
     if bus is not None:
         file.error(
             mark,
-            f"{model} of {name} speaks Protocol {protocols[0]}, bus {servo.bus} Protocol {bus.protocol}",
-            "put it on a bus of its own protocol; a bus cannot be mixed",
+            f"{model} of {name} has Protocol {protocols[0]}, but bus {servo.bus} has Protocol {bus.protocol}",
+            f"put {name} on a bus with Protocol {protocols[0]}",
         )
     return find_table(model, protocols[0])
 
@@ -237,10 +237,10 @@ def _check_reference(file: RobotFile, servo: DescribedServo, table: ControlTable
     if not travel.lower <= servo.reference <= travel.upper:
         file.warning(
             servo.mark(file.marks, "reference"),
-            f"reference {degrees(servo.reference)} deg of {servo.title} lies outside the travel of an "
-            f"{table.model} ({degrees(travel.lower)}..{degrees(travel.upper)} deg), so the joint can never "
-            "be at 0",
-            "check the reference: it is the servo's angle where the joint's is 0",
+            f"reference {degrees(servo.reference)} deg of {servo.title} is outside the travel of an "
+            f"{table.model} ({degrees(travel.lower)}..{degrees(travel.upper)} deg), so the joint cannot "
+            "reach 0",
+            "check the reference, the servo's angle at 0 of the joint",
         )
 
 

@@ -26,9 +26,9 @@ _UNLIKE: Mapping[JointUnit, tuple[str, str, str]] = {
     ROTARY: (
         "slides",
         "angles",
-        "give it a travel_per_turn here, or make it revolute there and let what it slides mimic it",
+        "add travel_per_turn here, or make it revolute in the URDF and add a prismatic mimic joint",
     ),
-    LINEAR: ("turns", "lengths", "make it prismatic there"),
+    LINEAR: ("turns", "lengths", "make it prismatic in the URDF"),
 }
 """Words for a joint of this unit whose URDF joint has the other kind: what the URDF does to it, what its
 positions are, and the fix."""
@@ -52,7 +52,7 @@ def compile_urdf(file: RobotFile, joints: Mapping[str, CompiledJoint]) -> Compil
     if not path.exists():
         file.error(
             mark,
-            f"there is no URDF {model.urdf}",
+            f"URDF {model.urdf} not found",
             "check the name; it is relative to the folder of this file",
         )
         return None
@@ -87,14 +87,14 @@ def compile_frames(
     imu, mark = model.imu or "", file.at("model", "imu")
     if imu and imu not in states:
         turning = [name for name, own in states.items() if set(ORIENTATION) <= set(own)]
-        what = f"model.imu is {imu}, which is not a device, sensor or controller with states"
+        what = f"model.imu {imu} is not a device, sensor or controller with states"
         file.error(mark, what, suggestion(imu, turning))
         return None
     if imu and not set(ORIENTATION) <= set(states[imu]):
         file.error(
             mark,
-            f"model.imu is {imu}, which has no orientation (x, y, z, w)",
-            "add an imu_sensor_broadcaster that reads it, and name that",
+            f"model.imu {imu} has no orientation (x, y, z, w)",
+            f"add an imu_sensor_broadcaster for {imu}, and write its name",
         )
         return None
     try:
@@ -106,8 +106,8 @@ def compile_frames(
     if model.imu_link and not imu:
         file.warning(
             file.at("model", "imu_link"),
-            "model.imu_link is the link of an IMU, and model.imu names none",
-            "name it, or remove imu_link",
+            "model.imu_link is given without model.imu",
+            "add imu, or remove imu_link",
         )
     return FramesPlan(model.frames_rate, body.moved, imu, tree.imu_link)
 
@@ -126,25 +126,25 @@ def _check_names(
         file.warning(
             mark,
             f"the URDF has no joint {', '.join(missing)}",
-            "give the joints of both files the same names; until then these are not shown",
+            "use the same names in both files; joints missing in the URDF are not shown",
         )
     stiff = [name for name in joints if name in drawn and not drawn[name].moves]
     if stiff:
-        file.warning(mark, f"the URDF does not let {', '.join(stiff)} turn", "make it revolute there")
+        file.warning(mark, f"{', '.join(stiff)} cannot turn in the URDF", "make it revolute")
     unlike = [name for name in joints if name in drawn and drawn[name].moves]
     unlike = [name for name in unlike if not _alike(joints[name], drawn[name])]
     for unit, (moves, positions, fix) in _UNLIKE.items():
         names = ", ".join(name for name in unlike if joints[name].plan.unit is unit)
         if names:
-            what = f"the URDF {moves} {names}, whose positions are {positions}, so frames show it at rest"
+            what = f"the URDF {moves} {names}, but positions are {positions}: frames show no motion"
             file.warning(mark, what, fix)
     for name in joints:
         mimic = drawn[name].mimic if name in drawn else None
         if mimic is not None:
             file.warning(
                 file.key("joints", name),
-                f"{name} follows {mimic.joint} in the URDF, but has a servo of its own, and the servo counts",
-                "remove the mimic from the URDF, or the joint out of this file",
+                f"{name} mimics {mimic.joint} in the URDF, but its servo has priority",
+                "remove the mimic from the URDF, or the joint from this file",
             )
 
 
@@ -161,7 +161,7 @@ def _check_limits(file: RobotFile, joint: CompiledJoint, drawn: UrdfJoint) -> No
             file.warning(
                 marks.value("joints", name, "limits", "position"),
                 f"{name} may move {allowed}, beyond its limits in the URDF, {shown}",
-                "make them equal",
+                "write the same limits in both files",
             )
     own = joint.described.limits.velocity
     unit = joint.plan.unit.speed
@@ -169,5 +169,5 @@ def _check_limits(file: RobotFile, joint: CompiledJoint, drawn: UrdfJoint) -> No
         file.warning(
             marks.value("joints", name, "limits", "velocity"),
             f"{name} may move at {own:g} {unit}, faster than in the URDF, {limits.velocity:g} {unit}",
-            "make them equal",
+            "write the same limits in both files",
         )

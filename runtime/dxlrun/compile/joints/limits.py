@@ -88,7 +88,7 @@ def check_samples(
             sample.targets[joint].mark,
             f"{joint} is sent to {where} at {(start_ns + sample.t_ns) * 1e-9:.3f} s, outside its limits "
             f"{limits_of(joints[joint])}",
-            "the gate will hold it at the limit; change the motion or the limits",
+            "change the motion or the limits; the gate holds the joint at the limit",
         )
     for joint, (speed, t_ns, mark) in fastest.items():
         report_speed(joints[joint], speed, f" at {(start_ns + t_ns) * 1e-9:.3f} s", mark, problems)
@@ -103,9 +103,9 @@ def report_speed(joint: JointPlan, speed: float, where: str, mark: Mark, problem
     if excess is None:
         return
     if excess.beyond_servo:
-        problems.error(mark, excess.text, f"{excess.fix}, or a shorter way")
+        problems.error(mark, excess.text, f"{excess.fix}, or shorten the way")
     else:
-        fix = f"the gate will hold it at the limit, so it comes late; {excess.fix}, or raise the limit"
+        fix = f"{excess.fix}, or raise the limit; the gate limits the speed, so the joint is late"
         problems.warning(mark, excess.text, fix)
 
 
@@ -132,8 +132,8 @@ def excess_speed(joint: JointPlan, speed: float, where: str) -> ExcessSpeed | No
     limit = register or ("the top speed of its servo" if own else "its velocity limit")
     shown = top if beyond_servo and top is not None and not register else most
     unit = joint.unit.speed
-    text = f"{joint.name} is asked for {speed:.4g} {unit}{where}, more than {shown:.4g} {unit}, {limit}"
-    fix = "give it more time"
+    text = f"{joint.name} is commanded to {speed:.4g} {unit}{where}, more than {shown:.4g} {unit}, {limit}"
+    fix = "allow more time"
     if 0 < abs(speed) < _MOST_LONGER * most:
         fix += f", {math.ceil(100 * abs(speed) / most - 1e-6) / 100:g} times as long"
     return ExcessSpeed(text, fix, beyond_servo)
@@ -230,19 +230,19 @@ def _beyond(
             most, own = joint.highest_effort, joint.highest_effort != joint.effort
             limit = "the highest goal of its servo" if own else "its effort limit"
             limit = _register_limit(joint, "effort") or limit
-            text = f"{joint.name} is asked for {effort:.6g}{where}, more than {most:.6g}, {limit}"
+            text = f"{joint.name} is commanded to {effort:.6g}{where}, more than {most:.6g}, {limit}"
             yield LimitViolation(joint.name, text)
     for joint, pwm in zip(joints, _row(joints, values, "pwm"), strict=False):
         if abs(pwm) > joint.highest_pwm:
             most, limit = joint.highest_pwm, _register_limit(joint, "pwm") or "the full voltage"
-            text = f"{joint.name} is asked for {pwm:.6g}{where}, more than {most:.6g}, {limit}"
+            text = f"{joint.name} is commanded to {pwm:.6g}{where}, more than {most:.6g}, {limit}"
             yield LimitViolation(joint.name, text)
 
 
 def _register_limit(joint: JointPlan, interface: LimitedInterface) -> str:
     """Return the name of the servo register that limits a joint, for messages; empty if none does."""
     own = joint.find_servo_limit(interface)
-    return "" if own is None else f"{own.text}, a register of its servo"
+    return "" if own is None else f"servo register {own.text}"
 
 
 def _row(joints: Sequence[JointPlan], values: Mapping[str, object], name: str) -> Sequence[float]:

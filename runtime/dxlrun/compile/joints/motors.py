@@ -76,8 +76,8 @@ def _read(path: Path, written: str, mark: Mark, problems: Problems) -> MotorDesc
     if not path.exists():
         problems.error(
             mark,
-            f"there is no motor file {written}",
-            "check the name; it is relative to the folder of this file, or let `dxlrun identify` write it",
+            f"motor file {written} not found",
+            "check the name, relative to the folder of this file, or make the file by `dxlrun identify`",
         )
         return None
     try:
@@ -103,9 +103,8 @@ def compile_motor(
     if motor.model not in (table.model, *table.aliases):
         file.error(
             mark,
-            f"{found.path.name} is of an {motor.model}, but {name} is an {table.model}",
-            "name a file of that model, as `dxlrun identify` writes it; or write the model into the file, if "
-            "its figures hold for both",
+            f"{found.path.name} describes an {motor.model}, but {name} is an {table.model}",
+            f"name a motor file of an {table.model}, or correct the model in the file",
         )
         return None
     item = next((table.items[each] for each in P_GAINS if each in table.items), None)
@@ -115,12 +114,12 @@ def compile_motor(
         missing = item is not None
         file.error(
             found.marks.key("position_gain" if missing else "p_gain"),
-            f"{found.path.name} gives a position_gain without the p_gain at which it was identified"
+            f"{found.path.name} has a position_gain without a p_gain"
             if missing
             else f"an {table.model} has no P gain",
-            f"write p_gain: {item.initial or 32}, the value of {item.name} then"
+            f"write p_gain: {item.initial or 32}, the value of {item.name} at the identification"
             if item is not None
-            else "remove it; position_gain is then the whole duty for each rad of error",
+            else "remove p_gain; position_gain is then the duty per rad of error",
         )
         return None
     if item is None or motor.p_gain is None:
@@ -129,7 +128,7 @@ def compile_motor(
     if gain is None and item.initial not in (None, motor.p_gain):
         file.warning(
             mark,
-            f"{name} was identified with {item.name} = {motor.p_gain}, and servos begin with {item.initial}",
+            f"{name} was identified with {item.name} = {motor.p_gain}, but servos start with {item.initial}",
             f"write `registers: {{{item.name}: {motor.p_gain}}}` for {name}",
         )
     return replace(motor, p_gain=motor.p_gain if gain is None else gain)

@@ -37,7 +37,7 @@ def any_value(table: BaseControlTable, name: str, value: int | str) -> RegisterV
         names = tuple(each.name for each in table.items.values() if each.access == "RW")
         raise UnfitRegister(f"an {table.model} has no register {name}", suggestion(name, names))
     if item.access == "R":
-        raise UnfitRegister(f"{item.title} can only be read", "remove it")
+        raise UnfitRegister(f"{item.title} is read-only", "remove it")
     raw = _raw(item, value)
     if not item.minimum <= raw <= item.maximum:
         raise UnfitRegister(
@@ -56,7 +56,9 @@ def _raw(item: ControlItem, value: int | str) -> int:
     if isinstance(value, int):
         return value
     if not item.unit:
-        raise UnfitRegister(f"{item.title} has no unit, but is {value!r}", "write a whole number")
+        raise UnfitRegister(
+            f"{item.title} is a whole number without a unit, not {value!r}", "write a whole number"
+        )
     ticks = (quantity(value, item.unit) - item.offset) / item.scale
     if not math.isfinite(ticks):
         raise UnfitRegister(f"{value} is out of the range of {item.title}", f"write {_range(item)}")

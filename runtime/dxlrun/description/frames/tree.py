@@ -115,8 +115,8 @@ class FrameTree:
         fixed = next((frame.name for frame in frames if frame.name in _ABOVE_ODOM), None)
         if fixed is not None:
             raise _refused(
-                f"the URDF has a frame {fixed}, and the IMU's link {self.imu_link} does not hang from {ODOM}",
-                f"make it the child of {ODOM} by a fixed joint, or remove {fixed}",
+                f"the URDF has a frame {fixed}, but no fixed joint from {ODOM} to the IMU's {self.imu_link}",
+                f"add this joint, or remove {fixed}",
             )
         self._turned = urdf.root
         return [Frame(ODOM, "", None, "root"), Frame(urdf.root, ODOM, None, "imu"), *frames[1:]]
@@ -139,7 +139,7 @@ class FrameTree:
         if frame.moved_by == "imu":
             return self._turned_by_imu(frame, positions, orientation)
         if frame.joint is None:
-            raise ValueError(f"{frame.name} has no joint")
+            raise ValueError(f"frame {frame.name} has no joint")
         base = self._bases[frame.joint.name]
         if not frame.joint.moves:
             return base
@@ -218,17 +218,17 @@ class FrameTree:
         known = [each.name for each in self.frames]
         for name in filter(None, (of, relative_to)):
             if name not in self._frames:
-                raise LookupError(f"there is no frame {name}; {suggestion(name, known)}")
+                raise LookupError(f"frame {name} not found; {suggestion(name, known)}")
         for name in positions:
             joint = self._joints.get(name)
             if joint is None or not joint.moves:
                 moving = [each.name for each in self._joints.values() if each.moves]
-                raise LookupError(f"there is no joint {name} that moves; {suggestion(name, moving)}")
+                raise LookupError(f"movable joint {name} not found; {suggestion(name, moving)}")
         ends = (of, relative_to or known[0])
         shared = self._shared(*ends)  # The frames above the common ancestor do not matter.
         found, base = (self._below(name, shared, positions, orientation) for name in ends)
         if found is None or base is None:
-            raise ValueError("a position is not known: give a number for each joint")
+            raise ValueError("a position is missing; give a number for each joint")
         return base.inverse @ found
 
 
@@ -248,7 +248,7 @@ def _imu_link(urdf: Urdf, imu: str, link: str) -> str:
     found = next((name for name in names if name in urdf.links), None)
     if found is None:
         what = f"the URDF has no link for the IMU {imu}: {', '.join(names[:-1])} or {names[-1]}"
-        raise _refused(what, "name the link on which it is mounted by `imu_link`")
+        raise _refused(what, "write the link of the IMU as `imu_link`")
     return found
 
 

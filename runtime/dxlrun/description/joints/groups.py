@@ -103,8 +103,8 @@ class _Places:
             self.moves[*path, key] = [(*path, one) for one in names]
             for one in names:
                 if one in result:
-                    what = f"{path_text(path)} has {one} twice, by the groups {origin[one]} and {key}"
-                    fix = f"write {one} outside of its groups too: that value counts"
+                    what = f"{path_text(path)} sets {one} twice, in groups {origin[one]} and {key}"
+                    fix = f"add a value for {one}; it has priority over groups"
                     self.problems.append(Problem(self._marks.key(*path, key), what, fix))
                 result[one], origin[one] = item, key
         return result
@@ -151,25 +151,25 @@ def _mistakes(grown: PlainDocument) -> Iterator[Problem]:
     joints, entries = _mapping(grown.data.get("joints")), _named(grown.data)
     if not isinstance(defaults := grown.data.get(DEFAULTS, {}), dict):
         what = f"{DEFAULTS} is {format_value(defaults)}, but must be a mapping"
-        yield Problem(grown.marks.value(DEFAULTS), what, "write keys of a joint in it")
+        yield Problem(grown.marks.value(DEFAULTS), what, f"write keys of a joint below {DEFAULTS}")
     for name, entry in _mapping(_mapping(grown.data.get("policies")).get(GROUPS)).items():
         if name in entries and "joints" in _mapping(entry):
-            what = f"{name} is a group of the robot already, and has its joints"
+            what = f"group {name} already has joints in the section groups"
             yield Problem(grown.marks.key("policies", GROUPS, name, "joints"), what, "remove joints")
     for name in _mapping(grown.data.get(GROUPS)):
         if name not in entries:
             means = "every joint" if name == ALL else "a joint"
-            what = f"{name} is the name of a group, and means {means} already"
+            what = f"the name {name} of a group already means {means}"
             yield Problem(grown.marks.key(GROUPS, name), what, "rename the group")
     for name in entries:
         for index, one in _written(entries, name):
             mark = grown.marks.value(GROUPS, name, "joints", index)
             if one not in joints and one not in entries:
-                what = f"group {name} has joint {one}, which is not defined"
+                what = f"joint {one} of group {name} is not defined"
                 yield Problem(mark, what, suggestion(one, (*joints, *entries)))
             elif circle := _circle(entries, (name, one)):
                 what = f"the group {name} contains itself ({' -> '.join(circle)})"
-                yield Problem(mark, what, "remove one of these names")
+                yield Problem(mark, what, f"remove {one} from {name}")
 
 
 def _circle(entries: Mapping[str, object], way: tuple[str, ...]) -> tuple[str, ...]:
@@ -216,11 +216,11 @@ def _disagreements(grown: PlainDocument, groups: Groups, layers: list[PlainDocum
             if first != value and path not in own:
                 joint, key = path[0], path_text(path[1:])
                 what = (
-                    f"{joint} gets {key} {format_value(value)} from group {name}, "
-                    f"but {format_value(first)} from {other}"
+                    f"groups {name} and {other} set {key} of {joint} to {format_value(value)} "
+                    f"and {format_value(first)}"
                 )
                 mark = layer.marks.value("joints", *path)
-                yield Problem(mark, what, f"give {joint} its own, or let one group alone give it")
+                yield Problem(mark, what, f"write {key} at {joint}, or in one group only")
 
 
 def _leaves(value: dict[str, object], path: KeyPath = ()) -> Iterator[tuple[KeyPath, object]]:

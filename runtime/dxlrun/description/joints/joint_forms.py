@@ -56,7 +56,7 @@ def _on_or_off(value: object) -> object:
     if isinstance(value, bool):
         return value
     if value not in ("on", "off"):
-        raise validation_error("torque is on or off", "write `torque: off` for a joint that is to be limp")
+        raise validation_error("torque is on or off", "write `torque: off` for a limp joint")
     return value == "on"
 
 
@@ -77,7 +77,7 @@ class JointSimulation(Form):
         0,
     )
     write_time: Annotated[Duration, Field(le=LONGEST_WRITE_TIME_NS)] = key(
-        "Time after a write during which the servo receives nothing.", "1 ms", 0
+        "Time after a write during which the servo ignores instructions.", "1 ms", 0
     )
     motor: MotorFile | None = key(
         "Motor file of the simulated servo; the joint's motor file by default.",
@@ -118,14 +118,14 @@ class BareJoint(Form):
         GoalTolerance.of_defaults(),
     )
     wrap: bool = key(
-        "Shorter way to each goal, for a continuous joint whose whole turns do not matter.", "true", False
+        "Shorter way to each goal, for continuous joints: whole turns do not matter.", "true", False
     )
 
     @model_validator(mode="after")
     def _wraps_where_continuous(self) -> Self:
         if self.wrap and not self.continuous:
             raise validation_error(
-                "wrap is for continuous joints: another joint has one way alone",
+                "wrap is for continuous joints only",
                 "write continuous: true, or remove wrap",
             )
         return self
@@ -180,7 +180,7 @@ class SharedJoint(ServoJoint):
     """Form of a joint that several servos move together; all get the same goal."""
 
     servos: Annotated[tuple[OneOfServos, ...], Field(strict=False, min_length=2)] = key(
-        "Servos of the joint, which supplies the keys that a servo omits.",
+        "Servos of the joint; the joint's keys are their defaults.",
         "[{id: 1}, {id: 2, direction: -1}]",
     )
     tolerance: SharedTolerance = key(
@@ -300,9 +300,9 @@ _MEASURES: Mapping[KeyPath, tuple[AlternativeQuantity, Mapping[JointUnit, str]]]
 _OF_OTHER_JOINTS: Mapping[JointUnit, Mapping[KeyPath, str]] = {
     ROTARY: {("simulation", "mass"): "write `inertia: 0.01 kg m^2`"},
     LINEAR: {
-        ("gear_ratio",): "remove it; travel_per_turn is its gear",
-        ("simulation", "inertia"): "a linear joint has a mass; write `mass: 0.2 kg`",
-        ("simulation", "gravity_angle"): "a linear joint has its weight everywhere; remove gravity_angle",
+        ("gear_ratio",): "remove it; travel_per_turn replaces it",
+        ("simulation", "inertia"): "write `mass: 0.2 kg`",
+        ("simulation", "gravity_angle"): "remove it",
     },
 }
 """Keys that joints of this kind cannot have, each with a fix."""
@@ -320,11 +320,11 @@ def misfits(joints: object) -> Iterator[tuple[KeyPath, str, str]]:
         is_so = f"{name} {unit.verb}"
         for path, fix in _OF_OTHER_JOINTS[unit].items():
             if _written(entry, path) is not None:
-                yield ("joints", name, *path), f"{is_so}, and has no {path[-1]}", fix
+                yield ("joints", name, *path), f"{is_so}, so {path[-1]} is not allowed", fix
         for path, (kind, examples) in measures.items():
             for step, written in _units(kind, _written(entry, path)):
                 if JointUnit.find_by_quantity(written) is not unit:
-                    what = f"{is_so}, and its {path[-1]} is in {written}"
+                    what = f"{is_so}, so its {path[-1]} cannot be in {written}"
                     yield ("joints", name, *path, *step), what, f"write it as {examples[unit]}"
 
 

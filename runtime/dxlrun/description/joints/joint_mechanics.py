@@ -49,7 +49,7 @@ _MOST_TOLERANCES: Mapping[JointUnit, float] = {ROTARY: math.radians(20.0), LINEA
 def _useful(value: Measure) -> Measure:
     if value > _MOST_TOLERANCES[value.joint_unit]:
         raise validation_error(
-            "a tolerance above 20 deg would let servos pull against each other unseen",
+            "a tolerance between servos is 20 deg at most",
             "write for example 3 deg",
         )
     return value
@@ -96,7 +96,7 @@ class SharedTolerance(GoalTolerance):
 
     alone: ClassVar[str] = "servos"
     servos: Tolerance | None = key(
-        "Largest difference between the servos, as a position of the joint; 3 deg or 1 mm by default.",
+        "Largest difference between the servos, at the joint; 3 deg or 1 mm by default.",
         "3 deg",
         None,
     )
@@ -106,7 +106,7 @@ def _whole(value: object) -> object:
     # True and 1.0 equal 1 in Python, but are not meant as a direction.
     if isinstance(value, bool | float):
         raise validation_error(
-            "a direction is 1 or -1", "write 1 when the angle grows as the servo's does, else -1"
+            "a direction is 1 or -1", "write 1 if the angles of joint and servo grow together, else -1"
         )
     return value
 

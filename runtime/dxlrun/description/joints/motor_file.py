@@ -37,7 +37,7 @@ _LONGEST_DELAY_NS = 100_000_000
 
 def _short(delay_ns: int) -> int:
     if delay_ns > _LONGEST_DELAY_NS:
-        raise validation_error("no servo needs over 100 ms", "check its unit: some milliseconds are usual")
+        raise validation_error("a delay is 100 ms at most", "check its unit; a few milliseconds are usual")
     return delay_ns
 
 
@@ -57,7 +57,7 @@ class LoadForm(Form):
     """Form of `load` in a motor file: what the motor moved while it was identified."""
 
     inertia: Annotated[Inertia, Field(ge=0)] = key(
-        "Moment of inertia of the load, in addition to the motor's own.", "0.01 kg m^2", 0.0
+        "Moment of inertia of the load, without rotor and gear.", "0.01 kg m^2", 0.0
     )
     gravity: Annotated[Torque, Field(ge=0)] = key(
         "Torque of the weight in the horizontal position.", "0.3 Nm", 0.0
@@ -127,7 +127,7 @@ class MotorForm(Form):
         None,
     )
     position_gain: Annotated[Stiffness, Field(gt=0)] | None = key(
-        "Share of the full voltage per rad of error and per unit of the P gain.", "0.158 1/rad", None
+        "Share of the full voltage per rad of position error and unit of the P gain.", "0.158 1/rad", None
     )
     p_gain: int | None = key(
         "Value of the P gain register during the identification; absent if the servo has no such register.",
@@ -167,8 +167,8 @@ def read_motor(path: Path) -> MotorDescription:
     file, text = str(path), read_text(path)
     grown = grow(parse(text, file), file, refuse_arguments)
     if not any(key in grown.data for key in _ESSENTIAL):
-        what = f"this is not a motor file: it has none of {', '.join(_ESSENTIAL)}"
-        raise refusal(Mark(file), what, "name a file as `dxlrun identify` writes it")
+        what = f"this is not a motor file: {', '.join(_ESSENTIAL)} are missing"
+        raise refusal(Mark(file), what, "give a motor file from `dxlrun identify`")
     form = read_form(grown, MotorForm)
     found = {name: float(value) for name, value in form.uncertainty if value is not None}
     # The form holds the delay in ns, the description in s.

@@ -11,18 +11,18 @@ from dxlrun.description.base_form import folded
 Kind = tuple[str, str]
 """Sentence that says what the file is (`this is ...`), and the fix."""
 
-_DRAFT = "`dxlrun scan PORT --output robot.yaml` writes a first robot file of the servos at a port"
+_DRAFT = "`dxlrun scan PORT --output robot.yaml` writes a draft of a robot file"
 _ROSBAGS = (
-    "`rosbags-convert --src {path} --dst {stem} --dst-storage mcap` (of `pip install rosbags`) makes an MCAP "
-    "file for `dxlrun replay --on` and `dxlrun convert`"
+    "`rosbags-convert --src {path} --dst {stem} --dst-storage mcap` (from `pip install rosbags`) converts it "
+    "to MCAP for `dxlrun replay --on` and `dxlrun convert`"
 )
 _MAGIC: Mapping[bytes, Kind] = {
     b"\x89MCAP0\r\n": (
         "this is a recording in MCAP",
-        "`dxlrun analyze {path}` shows what is in a log of dxlrun, `dxlrun replay {path}` plays it",
+        "`dxlrun analyze {path}` evaluates a log of dxlrun, `dxlrun replay {path}` plays it",
     ),
     b"#ROSBAG V": ("this is a ROS 1 bag", _ROSBAGS),
-    b"SQLite format 3\0": ("this is a ROS 2 bag in SQLite, or another data base", _ROSBAGS),
+    b"SQLite format 3\0": ("this is a ROS 2 bag in SQLite, or another database", _ROSBAGS),
 }
 LONGEST_MAGIC = max(map(len, _MAGIC))
 """Number of bytes at a file's start that `kind_of_bytes` needs."""
@@ -38,26 +38,26 @@ _TEXTS: tuple[tuple[re.Pattern[str], Kind], ...] = (
     (
         re.compile(r".*xmlns:xacro=", re.S),
         (
-            "this is a xacro file, which describes a body and no servos",
-            "make its URDF by `xacro {path} > {stem}.urdf`, and name that in a robot file: "
-            "`model: {urdf: {stem}.urdf}`",
+            "this is a xacro file: a body without servos",
+            "convert it by `xacro {path} > {stem}.urdf`, and write `model: {urdf: {stem}.urdf}` in a robot "
+            "file",
         ),
     ),
     (
         re.compile(r"\s*(<\?xml.*?\?>)?\s*(<!--.*?-->\s*)*<robot\b", re.S),
         (
-            "this is a URDF, which describes a body and no servos",
-            "name it in a robot file: `model: {urdf: {name}}`; " + _DRAFT,
+            "this is a URDF: a body without servos",
+            "write `model: {urdf: {name}}` in a robot file; " + _DRAFT,
         ),
     ),
-    (re.compile(r"\s*<(\?xml|[A-Za-z])"), ("this is XML", f"give a robot file, which is YAML; {_DRAFT}")),
+    (re.compile(r"\s*<(\?xml|[A-Za-z])"), ("this is XML", f"give a robot file in YAML; {_DRAFT}")),
     (
         re.compile(
             r"(?:\s*#.*\n)*\s*(from [\w.]+ import |import [\w.]+\s*(as \w+)?\s*$|def \w+\(|\"\"\")", re.M
         ),
         (
             "this is a program in Python",
-            "give a robot file; a controller is named in one: `type: ./{name}:CLASS`",
+            "give a robot file; for a controller, write `type: ./{name}:CLASS` in it",
         ),
     ),
 )
@@ -88,15 +88,15 @@ def _kinds(data: Mapping[str, object]) -> Iterator[Kind]:
     values = [value for value in data.values() if isinstance(value, dict)]
     if _has_key(data, "ros__parameters", 3) or not {"controller_manager", "/**"}.isdisjoint(data):
         yield (
-            "this is a parameter file of ROS 2, as ros2_control has it",
-            f"{_DRAFT}; docs/how-to/ros2.md has how both work together",
+            "this is a parameter file of ROS 2 (ros2_control)",
+            f"{_DRAFT}; docs/how-to/ros2.md explains how to use both",
         )
     elif not {"buses", "joints"} & data.keys() and _has_ros_type(data, 4):
-        yield "this is a parameter file of ROS", f"{_DRAFT}; docs/how-to/ros2.md has how both work together"
+        yield "this is a parameter file of ROS", f"{_DRAFT}; docs/how-to/ros2.md explains how to use both"
     if {"motorgroups", "motors"} <= data.keys():
         yield (
             "this is a configuration of pypot",
-            _DRAFT + "; angle_limit is `limits: {position: ...}` there, orientation is `direction`",
+            _DRAFT + "; write angle_limit as `limits: {position: ...}`, orientation as `direction`",
         )
     if (lerobot := _lerobot(data)) is not None:
         yield "this is a configuration of LeRobot", lerobot
@@ -139,7 +139,7 @@ def _lerobot(data: Mapping[str, object]) -> str | None:
         return None
     types = " ".join(str(arm["type"]) for arm in arms)
     if re.search(r"so_?10[01]|lekiwi", types):
-        return "its arms have servos of Feetech, and dxlrun drives Dynamixel servos only"
+        return "use arms with Dynamixel servos; dxlrun does not support Feetech servos"
     if "koch" in types:
         return "`dxlrun examples koch` copies a robot file for these arms"
     port = next((arm["port"] for arm in arms if "port" in arm), "PORT")
@@ -172,7 +172,5 @@ def ros_type(type_name: str, known: Collection[str]) -> tuple[str, str, str] | N
         return None
     name = folded(match[1])
     ours = name if name in known else _ROS_TYPES.get(name, "")
-    fix = (
-        f"write {ours}" if ours in known else "dxlrun has none of this name; `dxlrun plugins` lists its types"
-    )
+    fix = f"write {ours}" if ours in known else "choose a type of dxlrun; `dxlrun plugins` lists them"
     return f"{type_name} is a type of ROS", fix, ours if ours in known else ""

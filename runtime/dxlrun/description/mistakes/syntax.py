@@ -70,8 +70,8 @@ def _units_behind_lists(lines: list[str], file: str) -> Iterator[Problem]:
             written = ", ".join(f"{item} {_unit(match[3])}" for item in items)
             yield Problem(
                 Mark(file, number, match.start(3) + 1),
-                f"a list cannot have the unit {match[3]} as a whole",
-                f"write the unit at each number: [{written}]",
+                f"a list cannot have a unit ({match[3]})",
+                f"write the unit after each number: [{written}]",
             )
 
 
@@ -126,7 +126,9 @@ def _scanned(lines: list[str], file: str, *, by_keys: bool) -> list[Problem]:
                 pass
         elif opened or before in ("]", "}"):  # else it is part of a text
             mark = Mark(file, number + 1, column + 1)
-            problems.append(Problem(mark, f"this {character} closes nothing", "remove it, or open it before"))
+            problems.append(
+                Problem(mark, f"this {character} has no opening bracket", "remove it, or open the bracket")
+            )
     if opened:
         same = [each for each in opened if each.line == opened[-1].line]
         problems.append(_not_closed(same, lines, len(lines), file))
@@ -171,7 +173,7 @@ def _not_closed(unclosed: list[_Bracket], lines: list[str], number: int, file: s
     closers = "".join(_CLOSERS[each.character] for each in reversed(unclosed))
     return Problem(
         Mark(file, last.line + 1, last.column + 1),
-        f"the {last.character} that is opened here is not closed",
+        f"this {last.character} is not closed",
         f"write {closers} at the end{f' of line {end + 1}' if lines[1:] else ''}",
     )
 
@@ -180,6 +182,6 @@ def _mismatch(bracket: _Bracket, character: str, mark: Mark) -> Problem:
     where = f"the {character} in line {mark.line}, column {mark.column}"
     return Problem(
         Mark(mark.file, bracket.line + 1, bracket.column + 1),
-        f"the {bracket.character} that is opened here is not closed",
+        f"this {bracket.character} is not closed",
         f"write {_CLOSERS[bracket.character]} before {where}",
     )

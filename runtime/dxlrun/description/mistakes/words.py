@@ -38,13 +38,13 @@ _SERVO_FORM = "ServoEntry"  # base of the forms of servos with keys of a joint
 
 
 _NEEDLESS = {
-    "type": "remove it: the type of the controller decides that",
-    "model": "remove it: the mode of a servo follows from what the joint's controller commands",
-    "revolute": "remove it: a joint that is not linear turns",
+    "type": "remove it: only controllers have a type",
+    "model": "remove it: the joint's controller sets the mode of the servo",
+    "revolute": "remove it: joints turn by default",
     "continuous": "write `continuous: true`",
-    "prismatic": "write `travel_per_turn: 94.2 mm`, how far it moves in a turn of the servo",
-    "fixed": "remove the joint: one without a servo is in the URDF only",
-    "position": "remove it: the mode of a servo follows from what the joint's controller commands",
+    "prismatic": "write `travel_per_turn: 94.2 mm`, the travel per turn of the servo",
+    "fixed": "remove the joint: a joint without a servo belongs in the URDF only",
+    "position": "remove it: the joint's controller sets the mode of the servo",
 }
 """Values of a joint's needless keys `type` and `mode`, each with the fix."""
 
@@ -93,7 +93,7 @@ class UnknownKeyContext(msgspec.Struct, frozen=True):
             section = section_of(self.root, value)
             if section and not self._is_misplaced_section:
                 where = f"like {self.path[1]}" if section in self.path[:1] else f"below `{section}:`"
-                yield Remedy((key,), f"it has the keys of an entry of {section}: indent it {where}")
+                yield Remedy((key,), f"indent it {where}, as an entry of {section}")
             elif (meaning := meant.get(key)) is not None:
                 yield Remedy((key,), self._said_of(meaning, key, value), meaning.place[0])
             elif fix := self._misplaced(key, value):
@@ -152,31 +152,30 @@ class UnknownKeyContext(msgspec.Struct, frozen=True):
     def _renamed(self, meaning: _Meaning, word: str, value: object) -> str:
         """Return the fix that replaces a foreign term by dxlrun's key, with its value converted."""
         place, key = meaning.place, meaning.place[0]
-        called = "" if place[-1] == folded(word) else f"it is called `{'.'.join(place)}` here: "
         if key in self.present and len(place) == 1:
             if elsewhere := places_of(self.root, folded(word), value):
                 return self._moved(folded(word), value, elsewhere)
-            return f"it is called `{key}` here, which is given already: remove one of the two"
+            return f"remove it, or `{key}`: both mean the same"
         if (
             isinstance(value, dict | list)
             and not meaning.kind
             and key not in self.present
             and len(place) == 1
         ):
-            return f"{called}rename it"
+            return f"rename it to `{key}`"
         example = example_at(self.form, place)
         converted = _CONVERSIONS.get(meaning.kind or ".".join(place), _plain)(value, example)
         text, condition = converted or (example, "")
         such = "write" if converted is not None else "write for example"
         if key in self.present:
-            return f"{called}{such} `{place[-1]}: {text}` below `{key}`{condition}"
-        return f"{called}{such} `{self._at(place, text)}`{condition}"
+            return f"{such} `{place[-1]}: {text}` below `{key}`{condition}"
+        return f"{such} `{self._at(place, text)}`{condition}"
 
     def _reference(self) -> str:
         measure = "`dxlrun calibrate ROBOT.yaml` measures it"
         if "reference" in self.present:
-            return f"remove it: the zero of the joint is its `reference`; {measure}"
-        return f"write `reference`, the servo's angle where the joint is at zero, such as 180 deg; {measure}"
+            return f"remove it: `reference` sets the zero of the joint; {measure}"
+        return f"write `reference`, the servo's angle at the joint's zero, such as 180 deg; {measure}"
 
     def _misplaced(self, key: str, value: object) -> str:
         """Return the fix for a key of dxlrun at the wrong place, or misspelled; empty if none is found."""
@@ -195,14 +194,14 @@ class UnknownKeyContext(msgspec.Struct, frozen=True):
     def _miswritten(self, key: str, value: object) -> str:
         """Return the fix for text that is not a key, such as `rate=50`; empty if it may be one."""
         word, sign, rest = (part.strip() for part in re.split(r"([:=]|$)", key, maxsplit=1))
-        named = f"remove it: the entry is called {self.path[1]} already" if len(self.path) == 2 else ""
+        named = f"remove it: the entry already has the name {self.path[1]}" if len(self.path) == 2 else ""
         if key.endswith((")", "]")) and value is None:
             fix = "write a list in square brackets: [a, b]"
         elif sign and word in self.known and value is None:
-            how = "write a space after the colon" if sign == ":" else "write a colon for ="
+            how = "write a space after the colon" if sign == ":" else "write a colon instead of ="
             fix = f"{how}: `{word}: {rest}`"
         elif not self.path and isinstance(value, str) and value.startswith(("/dev/", "COM")):
-            fix = f"it belongs to a bus: `buses: {{main: {{port: {value}, ...}}}}`"
+            fix = f"write it at a bus: `buses: {{main: {{port: {value}, ...}}}}`"
         elif key == "name" and named:
             fix = named
         elif folded(key) in _REMARKS and not near(key, self.known):
@@ -224,14 +223,14 @@ class UnknownKeyContext(msgspec.Struct, frozen=True):
         below = place[common:-1]
         if common == len(here) and below and NAME not in below:
             if below[0] in self.present:
-                return f"it belongs in `{'.'.join(below)}`: move it there"
-            return f"it belongs in `{'.'.join(below)}`: write `{_in_mappings(below, written)}`"
+                return f"move it to `{'.'.join(below)}`"
+            return f"move it to `{'.'.join(below)}`: write `{_in_mappings(below, written)}`"
         names = [*self.sections.get(place[0], ())]
         entry = str(self.path[1]) if common >= 2 else names[0] if len(names) == 1 else NAME
         where = ".".join(entry if step == NAME else step for step in place[:-1])
         if not where:
-            return f"it belongs to the top of the file: write `{written}` without indentation"
-        return f"it belongs in `{where}`: write `{written}` there"
+            return f"move it to the top level: write `{written}` without indentation"
+        return f"move it to `{where}`: write `{written}` there"
 
 
 def misplaced_sections(
@@ -243,7 +242,7 @@ def misplaced_sections(
         inner = value if isinstance(value, dict) else {}
         own = [name for name in inner if name in root.model_fields and name not in data]
         if key not in root.model_fields and len(own) > 1:
-            fix = f"remove `{key}:`, and write what is in it without indentation"
+            fix = f"remove `{key}:` and the indentation of its keys"
             yield from (((key, name), fix) for name in own)
             continue
         for name in own if entries_of(root, key) is not None else ():
@@ -253,7 +252,7 @@ def misplaced_sections(
         if meaning is None or not isinstance(value, dict | list) or section_of(root, value):
             continue
         if len(meaning.place) == 1 and not meaning.kind and meaning.place[0] not in data:
-            yield (key,), f"it is called `{meaning.place[0]}` here: rename it"
+            yield (key,), f"rename it to `{meaning.place[0]}`"
 
 
 def words_for(form: str, keys: Collection[str]) -> frozenset[str]:
@@ -308,7 +307,7 @@ def _plain(value: object, example: str) -> _Written:
         return None
     unit = _UNIT.fullmatch(example)
     if unit is not None and _is_number(value):
-        return f"{_yaml(value)} {unit[1]}", f", if this is in {unit[1]}"
+        return f"{_yaml(value)} {unit[1]}", f", if the value is in {unit[1]}"
     return (_yaml(value), "") if unit is None or isinstance(value, str) else None
 
 
@@ -330,7 +329,7 @@ def _limits_text(values: list[object], *, of_urdf: bool = False, length: str = "
         name if value is None else f"{_yaml(value)} {unit}" if _is_number(value) else _yaml(value)
         for value, name in zip(values, ("LOWER", "UPPER"), strict=True)
     ]
-    return f"[{', '.join(texts)}]", f", if these are {unit}" if numbers and not of_urdf else ""
+    return f"[{', '.join(texts)}]", f", if the values are in {unit}" if numbers and not of_urdf else ""
 
 
 def _pair(value: object, example: str) -> _Written:
