@@ -3,23 +3,23 @@
 A trajectory commands a PID on positions, which commands two of the three joints of a PID on efforts;
 another controller commands the third. Clients send goals, cancel, switch, and request torque and reboots, and
 controllers fail.
-Judged by the simulated bus' ledger beside the log, see tests/kit/storms.py. CI runs 3 storms:
+Judged by the simulated bus' ledger and the log, see tests/kit/storms.py. CI runs 3 storms of 3 s. The full
+campaign, of 5 s each:
 
-    DXLRUN_CHAINED_STORMS=100 python -m pytest tests/simulation/test_chain_campaign.py -q
+    pytest --campaign=release tests/simulation/test_chain_campaign.py
 """
 
 from __future__ import annotations
 
 import json
-import os
 import random
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 from tests.kit import storms
+from tests.kit.campaigns import campaign
 from tests.kit.judges import log_has_every_byte
 
 from dxlrun.channels.answers import Acceptance
@@ -33,9 +33,6 @@ from dxlwire.bus_plan import BusPlan
 
 MS = 1_000_000
 SYNC_WRITE = 0x83
-COUNT = int(os.environ.get("DXLRUN_CHAINED_STORMS", "3"))
-SEED = os.environ.get("DXLRUN_STORM_SEED", "1")
-DURATION_S = 5.0 if "DXLRUN_CHAINED_STORMS" in os.environ else 3.0
 JOINT = (
     "  {name}: {{bus: main, id: {number}, model: XM430-W350, reference: 180 deg, "
     "direction: {direction}, {limits}}}\n"
@@ -75,34 +72,28 @@ FORBIDDEN = 200 * MS
 """What idle time had begun for a servo when a request came has ended by then."""
 
 
-def drawn_storms() -> list[Any]:
-    chance = random.Random(f"chains {SEED}")
-    drawn = []
-    for _ in range(COUNT):
-        seed, faults = chance.randrange(10**6), chance.randint(1, 8)
-        kinds = chance.choice(("", f" kinds={LASTING}", " kinds=reboot,lose,silence,overload"))
-        within = round((DURATION_S - 1) * 1000)
-        drawn.append(
-            pytest.param(f"storm seed={seed} faults={faults} within={within}ms{kinds} at=300ms", id=f"{seed}")
-        )
-    return drawn
+def draw_storm(chance: random.Random, duration_s: float) -> str:
+    seed, faults = chance.randrange(10**6), chance.randint(1, 8)
+    kinds = chance.choice(("", f" kinds={LASTING}", " kinds=reboot,lose,silence,overload"))
+    return f"storm seed={seed} faults={faults} within={round((duration_s - 1) * 1000)}ms{kinds} at=300ms"
 
 
-def built(directory: Path, chance: random.Random) -> VirtualRobot:
+def built(directory: Path, chance: random.Random, duration_s: float) -> VirtualRobot:
     text = HEAD
     for number, name in enumerate(JOINTS, 1):
         text += JOINT.format(name=name, number=number, direction=1 if number % 2 else -1, limits=LIMITS)
     path = directory / "chained.yaml"
     path.write_text(text + CONTROLLERS + chance.choice(POLICIES))
-    return simulated_robot(path, duration_s=DURATION_S, log=directory / "run.mcap")
+    return simulated_robot(path, duration_s=duration_s, log=directory / "run.mcap")
 
 
 class Clients:
     """Requests of every kind at random times, and controllers that fail."""
 
-    def __init__(self, robot: VirtualRobot, chance: random.Random) -> None:
+    def __init__(self, robot: VirtualRobot, chance: random.Random, duration_s: float) -> None:
         self.robot, self.chance, self.number = robot, chance, 0
-        for _ in range(chance.choice((5, 20, round(10 * DURATION_S)))):
+        self.end_ms = round(duration_s * 1000)
+        for _ in range(chance.choice((5, 20, round(10 * duration_s)))):
             self.at(
                 *chance.choice(
                     (
@@ -125,7 +116,7 @@ class Clients:
     def at(self, controller: str, kind: str, data: bytes) -> None:
         self.number += 1
         command = CommandMessage(self.number, controller, kind, data, "anna")
-        at_ns = self.chance.randrange(300, round(DURATION_S * 1000)) * MS
+        at_ns = self.chance.randrange(300, self.end_ms) * MS
         self.robot.buses[0].at(at_ns, lambda: self.robot.inbox.waiting.append(command))
 
     def goal(self) -> tuple[str, str, bytes]:
@@ -176,7 +167,7 @@ class Clients:
             loop = self.robot.robot.loop
             loop.manager._named[name].controller.update = breaks
 
-        self.robot.buses[0].at(self.chance.randrange(400, round(DURATION_S * 1000)) * MS, fail)
+        self.robot.buses[0].at(self.chance.randrange(400, self.end_ms) * MS, fail)
 
 
 def active_in(log: Log) -> list[set[str]]:
@@ -275,13 +266,13 @@ def nothing_for_released_joints(sent: Sequence[Any], bus: BusPlan, log: Log) -> 
             assert not found, (one, found)
 
 
-@pytest.mark.campaign
-@pytest.mark.parametrize("storm", drawn_storms())
-def test_a_storm_breaks_no_chain(storm, tmp_path):
-    print(storm)
-    chance = random.Random(storm)
-    robot = built(tmp_path, chance)
-    Clients(robot, chance)
+@campaign(ci=3, night=25, release=100)
+def test_a_storm_breaks_no_chain(number, amount, chance, tmp_path):
+    duration_s = min(5.0, amount)
+    storm = draw_storm(chance, duration_s)
+    print(f"{number}: {storm}")
+    robot = built(tmp_path, chance, duration_s)
+    Clients(robot, chance, duration_s)
     trial = storms.Trial.of(robot, [storm])
     assert trial.run()
     log = read_log(tmp_path / "run.mcap")

@@ -2,26 +2,23 @@
 
 Judged by the simulated buses' ledger alone, see tests/kit/storms.py: the promises of a robot in trouble.
 
-CI runs 4 short storms from a fixed seed, and storms in the set-up until a start of each robot has failed with
-torque on. The full campaign before a release, 30 s of the robots' time each:
+CI runs 4 short storms, and storms in the set-up until a start of each robot has failed with torque on. The
+full campaign before a release, 30 s of the robots' time each:
 
-    DXLRUN_STORMS=500 python -m pytest tests/simulation/test_faults_campaign.py -q
-
-`DXLRUN_STORM_SEED` (default 1) is what the storms are drawn from; a test's name is its robot and its storm.
+    pytest --campaign=release tests/simulation/test_faults_campaign.py
 """
 
 from __future__ import annotations
 
 import json
 import math
-import os
 import random
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from tests.kit import storms
+from tests.kit.campaigns import campaign
 
 from dxlrun.channels.answers import Acceptance, Answer, Code, Refusal
 from dxlrun.channels.commands import CommandMessage
@@ -39,33 +36,24 @@ ROBOT_OF = {
 }
 LASTING = ",".join(name for name in KINDS if name not in {"storm", "tip", "unplug"})
 ALL = f"{LASTING},unplug"
-FULL = "DXLRUN_STORMS" in os.environ
-DURATION_S = 30.0 if FULL else 2.5
+LONGEST_S = 30.0
 CLIENT = "anna"
 CUTTING = "silence,reboot,brownout"
 """Faults that a start does not bear, and that leave a line on which the other servos hear."""
-STARTS = max(1, int(os.environ.get("DXLRUN_STORMS", "8")) // 8)
-"""Failed starts of each robot."""
 MOST_STARTS = 20
-"""Storms that are drawn for each of them at most."""
+"""Storms that are drawn for each failed start at most."""
 
 
-def drawn_storms() -> list[Any]:
-    """Return robots in turn, and what happens to them."""
-    chance = random.Random(int(os.environ.get("DXLRUN_STORM_SEED", "1")))
-    drawn = []
-    for index in range(int(os.environ.get("DXLRUN_STORMS", "4"))):
-        robot = tuple(ROBOT_OF)[index % len(ROBOT_OF)]
-        kinds = chance.choice(("", f" kinds={LASTING}", f" kinds={ALL}", f" kinds={ALL}"))
-        begin = chance.choice((0, 300, 300, 300))  # the set-up is over after some 200 ms
-        seed, faults = chance.randrange(10**6), chance.randint(1, 10)
-        within = round((DURATION_S - 0.5) * 1000)
-        storm = f"storm seed={seed} faults={faults} within={within}ms{kinds} at={begin}ms"
-        drawn.append(pytest.param(robot, storm, id=f"{robot}-{seed}"))
-    return drawn
+def draw_storm(chance: random.Random, duration_s: float) -> str:
+    """Return a fault of the kind `storm`, which ends before the run."""
+    kinds = chance.choice(("", f" kinds={LASTING}", f" kinds={ALL}", f" kinds={ALL}"))
+    begin = chance.choice((0, 300, 300, 300))  # the set-up is over after some 200 ms
+    seed, faults = chance.randrange(10**6), chance.randint(1, 10)
+    within = round((duration_s - 0.5) * 1000)
+    return f"storm seed={seed} faults={faults} within={within}ms{kinds} at={begin}ms"
 
 
-def built(name: str, directory: Path, duration_s: float = DURATION_S) -> VirtualRobot:
+def built(name: str, directory: Path, duration_s: float) -> VirtualRobot:
     """Return a robot of eight servos whose goals move: by a motion, or by a client's commands."""
     log = directory / "run.mcap"
     lines = ROBOT_OF[name]
@@ -83,11 +71,11 @@ def ended(answer: Answer) -> bool:
     return isinstance(answer, Refusal) and answer.code is Code.RUN_ENDING
 
 
-def commanded(robot: VirtualRobot) -> dict[int, bytes]:
+def commanded(robot: VirtualRobot, duration_s: float) -> dict[int, bytes]:
     """Let a client send goals to every joint ten times a second; return them by number."""
     sent: dict[int, bytes] = {}
     rows = len(robot.plan.loop.joints)
-    for number in range(1, round(10 * DURATION_S) - 5):
+    for number in range(1, round(10 * duration_s) - 5):
         goals = np.array([0.5 * math.sin(0.3 * number + row) for row in range(rows)])
         command = CommandMessage(number, "all", "positions", goals.tobytes(), CLIENT)
         sent[number] = command.data
@@ -100,12 +88,11 @@ FIRST_REQUEST = 100_000
 """Number of the first request for joints."""
 
 
-def requested(robot: VirtualRobot, storm: str) -> int:
+def requested(robot: VirtualRobot, chance: random.Random, duration_s: float) -> int:
     """Let another client switch torque, reboot servos and activate what was released; return how often."""
-    chance = random.Random(storm)
     joints = [joint.name for joint in robot.plan.loop.joints]
     controllers = [one.name for one in robot.plan.loop.controllers if one.command]
-    count = chance.choice((0, 3, round(2 * DURATION_S)))
+    count = chance.choice((0, 3, round(2 * duration_s)))
     for number in range(count):
         some = chance.sample(joints, chance.choice((1, 1, 2, len(joints))))
         kind, data = chance.choice(
@@ -118,18 +105,19 @@ def requested(robot: VirtualRobot, storm: str) -> int:
             )
         )
         command = CommandMessage(FIRST_REQUEST + number, "", kind, json.dumps(data).encode(), "berta")
-        at_ns = chance.randrange(300, round(DURATION_S * 1000)) * 1_000_000
+        at_ns = chance.randrange(300, round(duration_s * 1000)) * 1_000_000
         robot.buses[0].at(at_ns, lambda command=command: robot.inbox.waiting.append(command))
     return count
 
 
-@pytest.mark.campaign
-@pytest.mark.parametrize(("name", "storm"), drawn_storms())
-def test_a_storm_breaks_no_promise(name, storm, tmp_path):
-    print(storm)
-    robot = built(name, tmp_path)
-    sent = {} if name == "torso" else commanded(robot)
-    requested(robot, storm)
+@campaign(ci=4, night=50, release=500)
+def test_a_storm_breaks_no_promise(number, amount, chance, tmp_path):
+    name, duration_s = tuple(ROBOT_OF)[number % len(ROBOT_OF)], min(LONGEST_S, 0.625 * amount)
+    storm = draw_storm(chance, duration_s)
+    print(name, storm)
+    robot = built(name, tmp_path, duration_s)
+    sent = {} if name == "torso" else commanded(robot, duration_s)
+    requested(robot, chance, duration_s)
     trial = storms.Trial.of(robot, [storm])
     started = trial.run()
     log = read_log(tmp_path / "run.mcap")
@@ -143,13 +131,12 @@ def test_a_storm_breaks_no_promise(name, storm, tmp_path):
     assert not started or not sent or accepted
 
 
-@pytest.mark.campaign
+@campaign(ci=1, night=6, release=62)
 @pytest.mark.parametrize("name", ROBOT_OF)
-def test_a_start_that_fails_after_torque_was_given_leaves_no_servo_with_it(name, tmp_path):
+def test_a_start_that_fails_after_torque_was_given_leaves_no_servo_with_it(name, amount, chance, tmp_path):
     """Storms in the set-up, until enough starts have failed when some servos had their torque."""
-    chance = random.Random(f"{os.environ.get('DXLRUN_STORM_SEED', '1')} {name}")
-    reached = 0
-    for number in range(MOST_STARTS * STARTS):
+    starts, reached = int(amount), 0
+    for number in range(MOST_STARTS * starts):
         storm = f"storm seed={chance.randrange(10**6)} faults=4 within=80ms kinds={CUTTING}"
         storm += f" at={chance.choice((60, 120, 180))}ms"
         directory = tmp_path / str(number)
@@ -159,9 +146,9 @@ def test_a_start_that_fails_after_torque_was_given_leaves_no_servo_with_it(name,
         print(storm, "started" if started else trial.refusal)
         trial.judge(read_log(directory / "run.mcap"))
         reached += trial.torque_was_given and not started
-        if reached == STARTS:
+        if reached == starts:
             return
-    raise AssertionError(f"only {reached} of {STARTS} starts failed with torque on: other faults or times?")
+    raise AssertionError(f"only {reached} of {starts} starts failed with torque on: other faults or times?")
 
 
 # A servo reboots at a random byte of the wire: in a set-up, in a cycle, in a gap, at the end.
@@ -176,26 +163,15 @@ LATEST_BYTE = 150_000
 """Some 1.5 s: a reboot at the very end is no longer seen."""
 
 
-def reboots() -> list[Any]:
-    """Return protocols in turn, the servo that reboots, at which byte, and for how long it is silent, ms."""
-    chance = random.Random(int(os.environ.get("DXLRUN_REBOOT_SEED", "1")))
-    drawn = []
-    for index in range(int(os.environ.get("DXLRUN_REBOOTS", "4"))):
-        protocol = (1.0, 2.0)[index % 2]
-        byte = chance.randrange(LATEST_BYTE)
-        boot_ms = chance.choice((50, 60, 100, 400) if protocol == 1.0 else (1, 10, 50, 60, 100, 400))
-        drawn.append((protocol, chance.randint(1, 8), byte, boot_ms))
-    return [pytest.param(*one, id=f"{index}-servo{one[1]}-byte{one[2]}") for index, one in enumerate(drawn)]
-
-
-@pytest.mark.campaign
-@pytest.mark.parametrize(("protocol", "servo_id", "byte", "boot_ms"), reboots())
-def test_a_reboot_at_any_byte_breaks_no_promise(protocol, servo_id, byte, boot_ms, tmp_path):
+@campaign(ci=4, night=40, release=200)
+def test_a_reboot_at_any_byte_breaks_no_promise(number, chance, tmp_path):
+    protocol, servo_id, byte = (1.0, 2.0)[number % 2], chance.randint(1, 8), chance.randrange(LATEST_BYTE)
+    boot_ms = chance.choice((50, 60, 100, 400) if protocol == 1.0 else (1, 10, 50, 60, 100, 400))
     log_path = tmp_path / "run.mcap"
     path = storms.servos(tmp_path, {"main": (protocol, 8)})
     robot = simulated_robot(path, duration_s=REBOOT_S, log=log_path)
     reboot = f"reboot servo={servo_id} for={boot_ms}ms at={byte * BYTE_NS // 1000}us"
-    print(reboot)
+    print(f"Protocol {protocol}: {reboot}")
     trial = storms.Trial.of(robot, [reboot])
     started = trial.run()
     log = read_log(log_path)

@@ -1,25 +1,21 @@
 """Campaign: random robots with gears, slides, several servos on a joint, differentials and matrices.
 
 Judged by the simulated bus' ledger alone: what the servos were sent and what they answered, in ticks, against
-what the log says of their joints. CI runs a seeded sample; the full campaign:
+what the log says of their joints. CI runs a sample of 1.5 s each; the full campaign, of 6 s each:
 
-    DXLRUN_MECHANICS_RUNS=40 DXLRUN_MECHANICS_STORMS=300 \\
-        python -m pytest tests/simulation/test_mechanics_campaign.py -q -rP
-
-`DXLRUN_MECHANICS_SEED` (default 1) is what robots, motions and storms are drawn from.
+    pytest --campaign=release tests/simulation/test_mechanics_campaign.py -rP
 """
 
 from __future__ import annotations
 
 import math
-import os
 import random
 from bisect import bisect_right
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-import pytest
+from tests.kit.campaigns import campaign
 from tests.kit.wire import FACTS, instructions, states, written
 
 from dxlrun.channels.commands import CommandMessage
@@ -34,11 +30,7 @@ from dxlsim.faults.kinds import KINDS
 from dxlsim.faults.script import FaultScript
 from dxlwire.bus_plan import BusPlan, ServoPlan
 
-SEED = os.environ.get("DXLRUN_MECHANICS_SEED", "1")
-RUNS = int(os.environ.get("DXLRUN_MECHANICS_RUNS", "1"))
-STORMS = int(os.environ.get("DXLRUN_MECHANICS_STORMS", "2"))
-FULL = STORMS > 10
-DURATION_S = 6.0 if FULL else 1.5
+LONGEST_S = 6.0
 RATE = 50
 SYNC_WRITE = 0x83
 MODELS = {1.0: ("AX-12A", 150, 140), 2.0: ("XM430-W350", 180, 170)}
@@ -216,17 +208,15 @@ class Spaces:
         return compared
 
 
-@pytest.mark.campaign
-@pytest.mark.parametrize("number", range(RUNS))
-def test_random_motions_are_the_same_in_both_spaces_to_a_tick(number, tmp_path):
-    chance = random.Random(f"{SEED} trip {number}")
-    robot = built(chance, tmp_path, DURATION_S)
+@campaign(ci=1, night=8, release=40)
+def test_random_motions_are_the_same_in_both_spaces_to_a_tick(number, amount, chance, tmp_path):
+    robot = built(chance, tmp_path, min(LONGEST_S, 1.5 * amount))
     assert robot.run().reason == "ended"
     log = read_log(tmp_path / "run.mcap")
     assert log.cycles["valid"].all()
     spaces = Spaces.of(robot)
     goals, positions = spaces.goals(log), spaces.positions(log)
-    print(f"{goals} goals of servos and {positions} positions of joints")
+    print(f"{number}: {goals} goals of servos and {positions} positions of joints")
     assert goals > 10 * len(robot.plan.buses[0].servos)
     assert positions == len(log.cycles) * len(log.joints)
     way = np.ptp(log.cycles["position"], axis=0) / [
@@ -237,17 +227,16 @@ def test_random_motions_are_the_same_in_both_spaces_to_a_tick(number, tmp_path):
     assert report.same, report
 
 
-@pytest.mark.campaign
-@pytest.mark.parametrize("number", range(STORMS))
-def test_no_goal_leaves_either_space_in_a_storm(number, tmp_path):
-    chance = random.Random(f"{SEED} storm {number}")
-    robot = built(chance, tmp_path, DURATION_S, beyond=chance.choice((1.0, 1.5, 4.0)))
-    within = round((DURATION_S - 0.5) * 1000)
+@campaign(ci=2, night=60, release=300)
+def test_no_goal_leaves_either_space_in_a_storm(number, amount, chance, tmp_path):
+    duration_s = min(LONGEST_S, 0.75 * amount)
+    robot = built(chance, tmp_path, duration_s, beyond=chance.choice((1.0, 1.5, 4.0)))
+    within = round((duration_s - 0.5) * 1000)
     faults, begin = chance.randint(1, 12), chance.choice((0, 300, 300))
     storm = (
         f"storm seed={chance.randrange(10**6)} faults={faults} within={within}ms at={begin}ms kinds={LASTING}"
     )
-    print(storm)
+    print(f"{number}: {storm}")
     FaultScript([parse_fault(storm)]).attach(robot.buses)
     try:
         robot.run()
