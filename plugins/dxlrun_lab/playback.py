@@ -53,10 +53,10 @@ class Playback(msgspec.Struct, frozen=True):
         speed = np.abs(np.diff(rows.positions, axis=0)).max(axis=0, initial=0.0) / rows.period_s
         widest, fastest = int(way.argmax()), int(speed.argmax())
         return (
-            f"{counted(len(rows.joints), 'joint', 'joints')} will be led to the first pose at up to "
+            f"{counted(len(rows.joints), 'joint', 'joints')} will move to the first pose at up to "
             f"{math.degrees(APPROACH_RAD_S):.0f} deg/s, and then play {rows.duration_s:.1f} s of "
-            f"{rows.motion.path}: {rows.joints[widest]} moves {math.degrees(way[widest]):.0f} deg, "
-            f"{rows.joints[fastest]} at up to {math.degrees(speed[fastest]):.0f} deg/s",
+            f"{rows.motion.path}; widest: {rows.joints[widest]}, {math.degrees(way[widest]):.0f} deg; "
+            f"fastest: {rows.joints[fastest]}, {math.degrees(speed[fastest]):.0f} deg/s",
         )
 
     def describe_motions(self, situation: Situation) -> Sequence[str]:
@@ -72,11 +72,11 @@ class Playback(msgspec.Struct, frozen=True):
         goals, states = (motion.what.count(what) for what in ("goals", "states"))
         end_s = motion.begin_s + motion.duration_s
         return (
-            f"first pose: {joint.plan.label} has the longest way, {math.degrees(ways[joint.name]):.1f} deg, "
+            f"first pose: {joint.plan.label} moves farthest, {math.degrees(ways[joint.name]):.1f} deg, "
             f"at up to {math.degrees(speed):.0f} deg/s",
             f"then {motion.begin_s:.3f} s to {end_s:.3f} s of {motion.path} at speed {rows.speed:g}, "
-            f"{rows.duration_s:.1f} s: {counted(goals, 'joint', 'joints')} as they were sent, "
-            f"{states} as measured",
+            f"{rows.duration_s:.1f} s: {counted(goals, 'joint', 'joints')} by sent goals, "
+            f"{states} by measured positions",
         )
 
     def procedure(self, situation: Situation) -> Procedure:

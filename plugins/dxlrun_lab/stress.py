@@ -62,13 +62,13 @@ class Stress:
         amount = f"{memory / 2**30:.2g} GB"
         if wanted and shutil.which("stress-ng"):
             self.text = (
-                f"stress-ng, {counted(cores, 'busy process', 'busy processes')}, 2 that allocate {amount} "
-                f"each, 1 that writes to {_DISK}"
+                f"stress-ng: {counted(cores, 'busy process', 'busy processes')}, 2 allocating {amount} "
+                f"each, 1 writing to {_DISK}"
             )
             words = ("stress-ng", "--quiet", "--cpu", str(cores), "--vm", "2", "--vm-bytes", str(memory))
             self._programs = [(_EXECUTE, *words, "--hdd", "1", "--temp-path", _DISK)]
         elif wanted:
-            self.text = f"1 busy process, 1 that allocates {amount} and writes to {_DISK}"
+            self.text = f"1 busy process, 1 allocating {amount} and writing to {_DISK}"
             self._programs = [(_COMPUTE,), (_ALLOCATE_AND_WRITE, str(memory), _DISK)]
 
     def __enter__(self) -> Self:
@@ -102,4 +102,4 @@ class Stress:
     def ended(self) -> tuple[str, ...]:
         """Return a remark if a process of the load has exited; empty while all run."""
         gone = any(process.poll() is not None for process in self._running)
-        return ("the load ended before the measurement did",) if gone else ()
+        return ("the load ended before the measurement",) if gone else ()

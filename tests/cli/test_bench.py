@@ -45,5 +45,5 @@ def test_the_runs_are_shown_in_a_table_and_the_rate_in_a_sentence(
     assert row.split()[0] in running
     assert row.split()[-1] == "yes"
     assert verdict.startswith(
-        f"single_joint keeps {row.split()[0]} Hz on this machine; its buses alone allow"
+        f"single_joint keeps {row.split()[0]} Hz on this machine; the buses allow"
     )

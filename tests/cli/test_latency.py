@@ -107,15 +107,15 @@ def test_without_a_compiler_the_yardstick_is_refused(dxlrun: Dxlrun, monkeypatch
     found = dxlrun("latency", "--compare", "other,c")
     assert found.code == 2
     assert found.errors == [
-        "dxlrun: the yardstick c is compiled on the spot, and there is no C compiler cc; install one "
-        "(Debian, Ubuntu: `sudo apt install gcc`), or omit c of --compare"
+        "dxlrun: c of --compare needs the C compiler cc; install a compiler (Debian, Ubuntu: "
+        "`sudo apt install gcc`), or omit c"
     ]
     monkeypatch.setenv("CC", sys.executable)
     (error,) = dxlrun("latency", "--compare", "other,c").errors
-    assert error.startswith("dxlrun: the yardstick c was not compiled: ")
+    assert error.startswith("dxlrun: c of --compare was not compiled: ")
     monkeypatch.setenv("CC", "/no/such/cc")
     (error,) = dxlrun("latency", "--compare", "other,c").errors
-    assert error.endswith("/no/such/cc cannot be run: No such file or directory")
+    assert error.endswith("/no/such/cc did not run: No such file or directory")
 
 
 def without_rights() -> None:
@@ -194,7 +194,7 @@ def test_what_was_measured_is_kept(tmp_path: Path, kill: bool) -> None:
     (one,) = result["conditions"]
     assert one["wake_ups"] > 10
     assert (running.returncode, result["interrupted"]) == ((1, False) if kill else (130, True))
-    assert result["failure"] == ("the process that measures other ended (SIGKILL)" if kill else "")
+    assert result["failure"] == ("the measuring process of other exited (SIGKILL)" if kill else "")
     assert (one["processor_share"] is None) == kill
     (topic,) = read_log(tmp_path / "kept.mcap").topics.values()
     assert len(topic.data) == one["wake_ups"]

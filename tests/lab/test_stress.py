@@ -52,7 +52,7 @@ def most_resident(process: int) -> int:
 def test_two_processes_load_the_machine_and_end_with_the_block(tmp_path):
     before = children(os.getpid())
     with Stress() as load:
-        assert load.text == f"1 busy process, 1 that allocates 0.016 GB and writes to {tmp_path}"
+        assert load.text == f"1 busy process, 1 allocating 0.016 GB and writing to {tmp_path}"
         started = children(os.getpid()) - before
         assert len(started) == 2
         until(lambda: all(cpu_ticks(one) > 10 for one in started))
@@ -102,7 +102,7 @@ def test_a_part_that_is_killed_is_reported():
     before = children(os.getpid())
     with Stress() as load:
         os.kill(min(children(os.getpid()) - before), signal.SIGKILL)
-        until(lambda: load.ended() == ("the load ended before the measurement did",))
+        until(lambda: load.ended() == ("the load ended before the measurement",))
 
 
 def test_a_disk_that_cannot_be_written_is_one_sentence_and_nothing_stays(tmp_path, monkeypatch):

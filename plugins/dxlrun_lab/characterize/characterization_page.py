@@ -21,7 +21,7 @@ from dxlrun_lab.figures.servo_figures import (
     points_drawing,
 )
 
-_TITLE = "What the servos can do"
+_TITLE = "Servo characteristics"
 
 
 def page(found: CharacterizationResult) -> str:
@@ -42,8 +42,8 @@ def page(found: CharacterizationResult) -> str:
         for joint in found.joints
     ]
     made = (
-        "Made by dxlrun characterize. The numbers of this page are in it as JSON, in SI units, in the "
-        "element with the identifier report."
+        "Made by dxlrun characterize. The element with the ID report contains the numbers of this page as "
+        "JSON, in SI units."
     )
     return document(f"{_TITLE}: {found.robot}", top, sections, footer(made), results(found))
 
@@ -73,8 +73,8 @@ def _drawings(joint: JointCharacteristics, tolerance: float) -> Iterator[Element
         curves = [(1e3 * step.time, np.degrees(step.way)) for step in joint.steps]
         height = math.degrees(joint.steps[0].height)
         text = (
-            f"{counted(len(curves), 'step', 'steps')} over one another; dashed: the goal, and the response "
-            "times with the intervals in which they lie."
+            f"{counted(len(curves), 'step', 'steps')}, overlaid; dashed: the goal, and the response times "
+            "with their intervals."
         )
         labels = ("time since the goal's packet, ms", "way, deg")
         yield curves_drawing(f"{name}-steps", "Step response", text, labels, curves, [height], marks)
@@ -95,7 +95,7 @@ def _drawings(joint: JointCharacteristics, tolerance: float) -> Iterator[Element
             [bool(one.fault) for one in tried],
         )
         mark = _mark(by_name.get(rates.NAME), rates.NAME, 1.0)
-        text = "Crossed: not kept. Cycles that only began late are the machine's and do not count."
+        text = "Crossed: rate not kept. Cycles that only started late do not count: the machine causes them."
         yield points_drawing(
             f"{name}-rates",
             "Rates",
@@ -117,8 +117,8 @@ def _drawings(joint: JointCharacteristics, tolerance: float) -> Iterator[Element
             for interface, tried in joint.gaps.items()
         ]
         text = (
-            "The most by which the joint was elsewhere than with a command in each cycle; crossed: too far, "
-            "or at rest between commands."
+            "Largest deviation from the path of a command in each cycle; crossed: too far, or at rest "
+            "between commands."
         )
         level = (f"tolerance {math.degrees(tolerance):.2g} deg", math.degrees(tolerance))
         yield points_drawing(
@@ -130,7 +130,7 @@ def _drawings(joint: JointCharacteristics, tolerance: float) -> Iterator[Element
         yield curves_drawing(
             f"{name}-band",
             "Dead band",
-            "The goal goes slowly to and fro and rests now and then; dashed: the dead band to each side.",
+            "The goal moves slowly back and forth, with rests; dashed: the dead band to each side.",
             ("goal, deg", "goal - position, deg"),
             [(np.degrees(joint.band.goal), np.degrees(joint.band.goal - joint.band.position))],
             [side * each for each in edge for side in (-1, 1)],

@@ -43,7 +43,7 @@ def parts(found: CharacterizationResult) -> Iterator[Part]:
             if one.value is None:
                 yield Sentence(f"{one.name} is not measurable: {one.why}", "warning")
     if found.why:
-        yield Sentence(f"it ended early: {found.why}", "error")
+        yield Sentence(f"the experiment ended early: {found.why}", "error")
 
 
 def table(found: JointCharacteristics) -> Table:
@@ -56,7 +56,7 @@ def table(found: JointCharacteristics) -> Table:
         Column("95 %"),
         Column("spread"),
         Column("measured by", "text"),
-        Column("limit, or parts", "text"),
+        Column("limit or cause", "text"),
     )
     rows = (
         (

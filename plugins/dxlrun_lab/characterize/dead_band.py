@@ -138,9 +138,7 @@ def dead_band(
     """
     up = [one.short for one in found if one.upward]
     down = [one.short for one in found if not one.upward]
-    how = (
-        f"{len(up)} rests from below and {len(down)} from above, approached at {math.degrees(SLOW):.0f} deg/s"
-    )
+    how = f"{len(up)} stops from below and {len(down)} from above, at {math.degrees(SLOW):.0f} deg/s"
     if min(len(up), len(down)) < 2:
         why = "the joint did not follow its goal, or did not come to rest"
         return not_measured(NAME, "rad", why, how), not_measured(REVERSAL, "rad", why, how)
@@ -149,16 +147,16 @@ def dead_band(
     band = mean_of(NAME, "rad", halves, 0.5 * tick, how, _parts(float(np.mean(halves)), registers, unit))
     changes = [one.reversal for one in found if math.isfinite(one.reversal)]
     if len(changes) < 2:
-        why = "the joint did not follow its goal back by enough to see where it began to"
+        why = "the joint did not follow the reversed goal far enough"
         return band, not_measured(REVERSAL, "rad", why, how)
-    return band, mean_of(REVERSAL, "rad", changes, 0.5 * tick, f"{len(changes)} reversals after these rests")
+    return band, mean_of(REVERSAL, "rad", changes, 0.5 * tick, f"{len(changes)} reversals after these stops")
 
 
 def _parts(whole: float, registers: Mapping[str, int], unit: float) -> str:
     """Describe which parts of a dead band (rad) the servo's margin and friction cause."""
     margins = [registers[name] * unit for name in MARGINS if name in registers]
     if not margins:
-        return "all by friction over the position gain: the model has no margin"
+        return "all by friction over the position gain; the model has no compliance margin"
     margin = sum(margins) / len(margins)
     left = max(0.0, whole - margin)
     return (

@@ -140,28 +140,30 @@ def longest_gap(
     """
     name = f"longest gap, {interface}"
     degrees = f"{math.degrees(tolerance):.2g} deg"
-    how = f"the thesis' motion at up to {speed:.2g} rad/s, {len(tried)} gaps; to stay within {degrees}"
+    how = f"motion of the thesis at up to {speed:.2g} rad/s, {len(tried)} gaps; tolerance {degrees}"
     if not tried:
         return not_measured(name, "s", "no gap was tried", how)
     bad = [gap for gap in tried if not gap.kept(tolerance)]
     if not bad:
         most = f"{tried[-1].gap_s * 1e3:.0f} ms"
-        why = f"the joint stayed within {degrees} at the longest gap that was tried, {most}"
+        why = f"the joint stayed within {degrees} at the longest tried gap, {most}"
         return not_measured(name, "s", why, how)
     first = bad[0]
     kept = [gap for gap in tried if gap.gap_s < first.gap_s]
     below_s, below = (kept[-1].gap_s, kept[-1].deviation) if kept else (shortest, 0.0)
     half = (first.gap_s - below_s) / 2
     if not kept:
-        why = f"the joint leaves its path at {first.gap_s * 1e3:.1f} ms already, the next gap after one cycle"
+        why = f"the joint leaves its path at the shortest tried gap, {first.gap_s * 1e3:.1f} ms"
         return not_measured(name, "s", why, how)
     if first.stood and first.deviation <= tolerance:
         return JointFigure(
-            name, "s", below_s + half, half, None, len(tried), how, "it comes to rest between commands"
+            name, "s", below_s + half, half, None, len(tried), how, "the joint stops between commands"
         )
     # Interpolate, because the deviation grows with the gap.
     part = (tolerance - below) / (first.deviation - below)
-    limit = f"it leaves its path by {math.degrees(first.deviation):.2g} deg at {first.gap_s * 1e3:.0f} ms"
+    limit = (
+        f"the joint leaves its path by {math.degrees(first.deviation):.2g} deg at {first.gap_s * 1e3:.0f} ms"
+    )
     # A deviation is the difference of two positions that are rounded to ticks.
     coarse = tick * 2 * half / (first.deviation - below)
     # The deviation may grow anywhere between the two gaps.

@@ -103,7 +103,7 @@ class CharacterizationExperiment:
         """
         require_own_servos(situation.plan, situation.names, "characterize", gears=True)
         return [
-            f"{joint.name}: {', '.join(self._measurements)}; as fast as "
+            f"{joint.name}: {', '.join(self._measurements)}; up to "
             f"{math.degrees(joint.plan.highest_speed):.0f} deg/s, "
             f"from {math.degrees(joint.inner[0]):.0f} to {math.degrees(joint.inner[1]):.0f} deg"
             for joint in situation.joints
@@ -128,7 +128,7 @@ class CharacterizationExperiment:
                     yield from parts[measurement](situation, joint, found)
                 except Refused as refusal:
                     found.figures += [
-                        not_measured(name, unit, f"the run refuses it: {refusal}")
+                        not_measured(name, unit, f"the run refused the measurement: {refusal}")
                         for name, unit in _FIGURES[measurement]
                         if found.value(name) is None
                     ]
@@ -137,7 +137,7 @@ class CharacterizationExperiment:
         self, situation: Situation, recorded: Sequence[SegmentRecording], why: str
     ) -> CharacterizationResult:
         """Return the results of all joints. Each figure that was not measured has the reason `why`."""
-        reason = f"the experiment ended before: {why}" if why else "nothing was recorded"
+        reason = f"the experiment ended early: {why}" if why else "nothing was recorded"
         for joint in situation.joints:
             found = self._found.setdefault(joint.name, JointCharacteristics(joint))
             known = {one.name for one in found.figures}
@@ -290,7 +290,7 @@ class CharacterizationExperiment:
             inner_low, inner_high = low + reach, high - reach
             places = [inner_low + part * (inner_high - inner_low) for part in _BAND_PLACES]
             rows, _ = dead_band.table(dead_band.stops(places, reach), 1 / rate)
-            title = f"{joint.name}: rests approached from both sides, within {math.degrees(reach):.2g} deg"
+            title = f"{joint.name}: stops from both sides, within {math.degrees(reach):.2g} deg"
             recorded = yield Segment(title, 1 / rate, {joint.name: rows}, loop_rate=rate)
             trace = self._trace(situation, joint, recorded)
             rests = dead_band.approaches(trace)
@@ -344,7 +344,7 @@ class CharacterizationExperiment:
         time = np.arange(lead + math.ceil((gaps.MOTION_S + gaps.FADE_S) / gap)) * gap - lead * gap
         position, _ = gaps.motion(np.maximum(time, 0.0), size)
         rows = {joint.name: joint.middle + position}
-        title = f"{joint.name}: a motion in gaps of {gap * 1e3:.1f} ms, {interface}"
+        title = f"{joint.name}: a motion with commands every {gap * 1e3:.1f} ms, {interface}"
         speeds_of: Mapping[str, Floats] = {}
         if interface == "posvel":
             # Mean speed from the previous sample to this one.

@@ -153,12 +153,12 @@ def highest_rate(tried: Sequence[RateResult], plan: Plan, servo: str) -> JointFi
     if best >= fitting(by_bus, step):
         budget = max((bus for bus in plan.buses), key=lambda bus: bus.budget.total_ns)
         limit = (
-            f"the bus: at {budget.baud_rate} bit/s and {budget.return_delay_ns / 1e3:.0f} us of return delay "
-            f"its exchange takes {budget.budget.total_ns / 1e6:.2f} ms by computation; the run goes no faster"
+            f"the bus: at {budget.baud_rate} bit/s and {budget.return_delay_ns / 1e3:.0f} us return delay, "
+            f"an exchange takes {budget.budget.total_ns / 1e6:.2f} ms (computed)"
         )
         between = min(by_bus - best, float(step)) if step else by_bus - best
         return JointFigure(NAME, "Hz", best, max(between, 0.0), None, len(tried), how, limit)
-    return JointFigure(NAME, "Hz", best, None, None, len(tried), how, "nothing: no higher rate was tried")
+    return JointFigure(NAME, "Hz", best, None, None, len(tried), how, "none found: no higher rate was tried")
 
 
 def _reason(rate: RateResult, servo: str) -> str:
@@ -167,4 +167,4 @@ def _reason(rate: RateResult, servo: str) -> str:
         return f"the servo: {rate.lost} of {rate.cycles} replies of {servo} are lost {at}"
     if rate.fault == "bus":
         return f"the bus: a cycle's exchange takes {rate.exchange_s * 1e3:.2f} ms {at}"
-    return f"the run: {rate.text or f'it refuses to go {at}'}"
+    return f"the run: {rate.text or f'refused {at}'}"

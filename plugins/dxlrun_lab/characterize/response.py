@@ -132,22 +132,22 @@ def _rested(step: StepResponse) -> bool:
 def _not_usable(steps: Sequence[StepResponse]) -> str:
     """Return the reason why no response time can be found from the steps, one sentence; empty if it can."""
     if len(steps) < LEAST_STEPS:
-        return f"{len(steps)} steps were recorded in which the joint rested before; {LEAST_STEPS} are needed"
+        return f"only {len(steps)} steps started at rest; {LEAST_STEPS} are needed"
     most, height = max(float(np.max(step.way)) for step in steps), steps[0].height
     if height < LEAST_TICKS * steps[0].tick:
         step, tick = math.degrees(height), math.degrees(steps[0].tick)
         return (
             f"the range allows steps of {step:.2g} deg, too small for positions in ticks of {tick:.2g} deg; "
-            f"a range of about {math.ceil(2.5 * LEAST_TICKS * tick):.0f} deg would do"
+            f"give a range of about {math.ceil(2.5 * LEAST_TICKS * tick):.0f} deg"
         )
     if most < max(LEAST_TICKS * steps[0].tick, height / 4):
         moved, of = math.degrees(most), math.degrees(height)
-        return f"the joint moved by {moved:.2g} deg at most in steps of {of:.2g} deg"
+        return f"the joint moved by only {moved:.2g} deg in steps of {of:.2g} deg"
     if sum(map(_rested, steps)) < LEAST_STEPS:
         return "the joint did not come to rest after its steps"
     slow = max(step.packets_s for step in steps)
     if slow > 0:
-        return f"the goal did not go in one packet but took {slow * 1e3:.0f} ms; see limits.acceleration"
+        return f"each step was sent in several packets, for {slow * 1e3:.0f} ms; raise limits.acceleration"
     return ""
 
 
@@ -180,7 +180,7 @@ def _pooled(
         student(count - 1) * error, resolution, *(one for one in others if math.isfinite(one))
     )
     if uncertainty > max(value, 0.5 * _CLEAR_S):
-        found = f"it is {value * 1e3:.0f} ms, uncertain by {uncertainty * 1e3:.0f} ms"
+        found = f"{value * 1e3:.0f} ms, with an uncertainty of {uncertainty * 1e3:.0f} ms"
         why = f"{found}: the positions scatter too much, or are too coarse"
         return not_measured(name, "s", why, how)
     return JointFigure(name, "s", max(0.0, value), uncertainty, _spread(pools), count, how)

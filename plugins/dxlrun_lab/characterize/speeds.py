@@ -125,7 +125,7 @@ def speeds(
     moves = [move for step in steps if (move := move_of(step)) is not None]
     units = {TOP: "rad/s", ACCELERATION: "rad/s^2", BRAKING: "rad/s^2"}
     if len(moves) < max(2, len(steps) // 2):
-        why = "the joint hardly moved" if steps else "no move was recorded in which the joint rested before"
+        why = "the joint hardly moved" if steps else "no move started at rest"
         top, faster, slower = (not_measured(name, unit, why, how) for name, unit in units.items())
         return top, faster, slower
     period = float(np.median(np.diff(steps[0].time)))
@@ -142,15 +142,15 @@ def _top(moves: Sequence[Move], range_rad: float, own_speed: float, how: str) ->
         fastest = float(np.median([move.highest for move in moves]))
         needed = _needed_range(moves, own_speed)
         why = (
-            f"the range of {math.degrees(range_rad):.0f} deg is too small to reach it: the joint came to "
-            f"{fastest:.3g} rad/s and did not cruise; a range of about {needed:.0f} deg would do"
+            f"the range of {math.degrees(range_rad):.0f} deg is too small: the joint reached "
+            f"{fastest:.3g} rad/s, but no constant speed; give a range of about {needed:.0f} deg"
             if needed is not None
-            else f"the joint came to {fastest:.3g} rad/s and did not cruise before its move was over"
+            else f"the joint reached {fastest:.3g} rad/s, but no constant speed within a move"
         )
         return not_measured(TOP, "rad/s", why, how)
     limit = ""
     if sum(move.follows for move in cruising) > len(cruising) // 2:
-        limit = "its goal went no faster: see limits.velocity, and Moving Speed or the profile's velocity"
+        limit = "the goal's own speed: see limits.velocity, and Moving Speed or Profile Velocity"
     drift = float(np.median([move.drift for move in cruising]))
     return mean_of(TOP, "rad/s", [move.highest for move in cruising], drift, how, limit)
 
@@ -177,10 +177,10 @@ def _change(name: str, moves: Sequence[Move], times: Sequence[float], period: fl
     part = RISE[1] - RISE[0]
     known = [(move.highest, time) for move, time in zip(moves, times, strict=True) if math.isfinite(time)]
     if len(known) < max(2, len(moves) // 2):
-        return not_measured(name, "rad/s^2", "its beginning or end was not seen", how)
+        return not_measured(name, "rad/s^2", "the start or end of the change was not recorded", how)
     median = float(np.median([time for _, time in known]))
     if median < 1.5 * period:
-        why = f"it takes less than {1.5 * period * 1e3:.1f} ms, about the time between two positions"
+        why = f"it takes less than {1.5 * period * 1e3:.1f} ms, too short for the read rate"
         return not_measured(name, "rad/s^2", why, how)
     values = [part * speed / time for speed, time in known]
     # The window of a slope smooths quick changes. Inside a ramp it shifts both crossings alike.

@@ -90,7 +90,7 @@ def _on_the_wire(servo: ServoPlan, buses: Sequence[BusPlan]) -> tuple[int, int]:
             place = group.index(index) + 1
             part_ns = replies_ns if fast else replies_ns * place // len(group)
             return part_ns + bus.latency_ns, goal_ns
-    raise LookupError(f"no bus has the servo of {servo.joint}")
+    raise LookupError(f"the servo of {servo.joint} is on no bus")
 
 
 def slopes(time: Floats, values: Floats, half_width: float) -> Floats:

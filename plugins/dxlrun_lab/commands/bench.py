@@ -37,9 +37,9 @@ def bench_rate(
         Duration of the run at each rate, s.
     """
     if not robot.is_file():
-        raise InputError(f"there is no robot file {robot}; check the path")
+        raise InputError(f"robot file {robot} not found; check the path")
     if not 0.1 <= duration <= 3600:
-        raise InputError(f"--duration {duration:g}: give from 0.1 to 3600")
+        raise InputError(f"--duration {duration:g}: give 0.1 to 3600 s")
     from dxlrun.tooling.robots import read_robot
     from dxlrun_lab.highest_rate import highest_rate, runs_to_discard
 
@@ -85,7 +85,9 @@ def _rates(result: HighestRate) -> Table:
 
 
 def _highest(result: HighestRate) -> str:
-    computed = f"its buses alone allow {result.computed_hz:g} Hz"
+    computed = f"the buses allow {result.computed_hz:g} Hz"
     if result.kept_hz is None:
-        return f"{result.robot} kept no rate in {counted(len(result.tries), 'run', 'runs')}; {computed}"
+        return (
+            f"{result.robot} kept no rate ({counted(len(result.tries), 'rate', 'rates')} tried); {computed}"
+        )
     return f"{result.robot} keeps {result.kept_hz:g} Hz on this machine; {computed}"

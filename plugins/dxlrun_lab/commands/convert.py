@@ -43,7 +43,7 @@ def convert(
         moved the joints in the log.
     """
     if motion.suffix not in (".yaml", ".yml"):
-        raise InputError(f"a motion file is YAML, so its name ends in .yaml, not as {motion} does")
+        raise InputError(f"motion file {motion} does not end in .yaml; choose another name")
     tolerance = part.tolerance_rad
     from dxlrun_analysis.playback.motion_file import motion_file
     from dxlrun_analysis.playback.spline_path import tolerances
@@ -51,7 +51,7 @@ def convert(
     check_target(motion)
     recorded = part.read_motion(log)
     allowed = tolerances(recorded, tolerance)
-    nearest = f"at most {math.degrees(float(allowed.max())):.4g} deg from it"
+    nearest = f"with a deviation of at most {math.degrees(float(allowed.max())):.4g} deg"
     origin = f"Motion of {_where(recorded)}, {nearest}.\nWritten by `dxlrun convert`."
     written = motion_file(recorded, allowed, motion, controller, origin)
     write_target(motion, written.text)

@@ -106,21 +106,23 @@ def _of_log(
     from dxlrun_lab.identify.identification import from_log
 
     if not log.exists():
-        raise InputError(f"there is no log {log}; a run prints the path of its log when it ends")
+        raise InputError(f"log {log} not found; a run prints the path of its log at its end")
     if (
         options.virtual
         or options.robot
         or options.range
         or any(":=" in word or "." in word for word in words)
     ):
-        raise InputError("--recorded evaluates an earlier run, and nothing moves; name joints only")
+        raise InputError("--recorded evaluates a log, without a robot; name joints only")
     with err().status("computing the result"):
         return from_log(read_log(log), words, chosen)
 
 
 def _check(duration: float, inertia: float | None, gravity: float | None, voltage: float | None) -> None:
     if not 0.0 < duration <= _LONGEST_S:
-        raise InputError(f"--duration {duration:g}: give how long each joint moves, at most {_LONGEST_S:g} s")
+        raise InputError(
+            f"--duration {duration:g}: give the time of motion of each joint, up to {_LONGEST_S:g} s"
+        )
     if inertia is not None and not 0.0 <= inertia < 1e3:
         raise InputError(f"--load-inertia {inertia:g}: give the inertia of the load in kg m^2, 0 or more")
     if gravity is not None and not 0.0 < gravity < 1e4:

@@ -107,7 +107,7 @@ def latency(
     if report is not None:
         check_report(report, "bokeh")
     if log is not None and not record:
-        raise InputError("--log and --no-record contradict each other; give one of them")
+        raise InputError("--log and --no-record exclude each other; omit one")
     return _measured(settings, stress, _log_place(log, record), report, as_json=as_json)
 
 
@@ -162,7 +162,7 @@ def _show(
 
     code = _INTERRUPTED if measured.interrupted else 1 if measured.failure else 0
     why = (measured.failure, "interrupted" if measured.interrupted else "")
-    failures = [f"{one}; the table has what was measured before" for one in why if one]
+    failures = [f"{one}; the table has the earlier results" for one in why if one]
     result = figures(settings, measured.blocks, load, measured.remarks)
     if not result.conditions:
         _discard(target)
@@ -237,7 +237,7 @@ def _log_place(log: Path | None, record: bool) -> Path | None:
     if log.suffix == ".mcap":
         check_target(log)
     elif log.exists() and not log.is_dir():
-        raise InputError(f"--log {log}: this is not a directory, and a log's name ends in .mcap")
+        raise InputError(f"--log {log} is neither a directory nor a .mcap file; correct the path")
     return log
 
 

@@ -95,8 +95,8 @@ class RobotFileArguments(NamedTuple):
         joints = tuple(word for word in rest if ":=" not in word)
         if assignments and file is None:
             raise InputError(
-                f"{assignments[0]} is an argument of a robot file, and there is none; "
-                "write ROBOT.yaml before it, or omit it"
+                f"{assignments[0]} is an argument of a robot file, but no file is given; "
+                "write ROBOT.yaml first"
             )
         return cls(file, assignments, joints)
 
@@ -209,7 +209,7 @@ def perform_on(
             with err().status("computing the result"):
                 result = experiment.evaluate_recordings(situation, performed.recorded, performed.why)
         except KeyboardInterrupt:  # the computation can take long
-            print_error(f"{rig.plan.robot}: what was measured is in {rig.log}")
+            print_error(f"{rig.plan.robot}: the measurements are in {rig.log}")
             raise
         except DxlrunError as error:
             if not performed.why:
@@ -224,7 +224,7 @@ def _ended(ran: ExperimentRun[R], performed: ExperimentOutcome, course: Course) 
     """Print to stderr why an experiment ended early, and what was not restored; return the outcome."""
     if ran.why:
         kept = len(performed.recorded) if course.ranges is not None else 0
-        left = f"; {counted(kept, 'piece', 'pieces')} measured before that" if kept else ""
+        left = f"; {counted(kept, 'segment', 'segments')} measured before" if kept else ""
         print_error(f"{ran.robot}: {course.name} ended early: {ran.why}{left}")
     for problem in ran.problems:
         print_warning(f"{ran.robot}: {problem}")
@@ -240,12 +240,12 @@ def _plan_of(
 
     if chosen.file is not None:
         if options.robot is not None:
-            raise InputError("--robot names a robot that runs, the robot file starts one; omit one")
+            raise InputError("--robot (a running robot) and a robot file exclude each other; omit one")
         plan = compiled(chosen.file, chosen.assignments, (), None).plan
         check_joints(chosen.joints, ranges, plan.loop.joints)
         return plan
     if options.virtual:
-        raise InputError("--virtual simulates the robot of a file; write ROBOT.yaml before the joints")
+        raise InputError("--virtual needs a robot file; write ROBOT.yaml before the joints")
     return None
 
 
@@ -275,7 +275,7 @@ def _rig(
             raise
     if not plan.gateway:
         raise InputError(
-            f"{chosen.file} switches the gateway off, but an experiment needs it: "
+            f"{chosen.file} disables the gateway, but an experiment needs the gateway; "
             "write `processes: {gateway: {enabled: true}}`"
         )
     require_whole(plan.recording, str(chosen.file))
@@ -326,7 +326,7 @@ def _start_confirmed(
         for name in names
     ]
     sys.stderr.write("".join(f"{line}\n" for line in lines))
-    sys.stderr.write(f"{plan.robot} is started for it, and switches torque on as its file says\n")
+    sys.stderr.write(f"{plan.robot} will start now and enable torque as in its file\n")
     return _confirmed(plan, options, aborting)
 
 
@@ -342,8 +342,8 @@ def _confirmed(plan: Plan, options: ExperimentOptions, aborting: AbortMonitor) -
         return True
     if not sys.stdin.isatty():
         raise InputError(
-            f"{plan.robot} has real servos, and without a terminal nobody can confirm that they may move; "
-            "nothing was moved; add --yes"
+            f"{plan.robot} has real servos, and their motion cannot be confirmed without a terminal "
+            "(nothing was moved); add --yes"
         )
     sys.stderr.write("Keep clear of the robot, and have its power switch at hand. Continue? [y/N] ")
     sys.stderr.flush()
@@ -356,7 +356,7 @@ def _confirmed(plan: Plan, options: ExperimentOptions, aborting: AbortMonitor) -
 def _counted_down(situation: Situation, options: ExperimentOptions, aborting: AbortMonitor) -> bool:
     """Count down before a real joint moves. Return False if the user aborted."""
     if aborting.has_keys:
-        sys.stderr.write("any key ends it: the joints come to rest, and the run is left as it was\n")
+        sys.stderr.write("any key ends the experiment: the joints stop, and the run is restored\n")
     if not _real(situation.plan, options):
         return aborting() is None
     names = ", ".join(situation.names)
@@ -432,5 +432,5 @@ class AbortMonitor:
         """Return the reason why the user aborted the experiment, or None; polls the keys."""
         if self.reason is None and self._keys and select.select([sys.stdin], [], [], 0)[0]:
             # An empty read means that the terminal was closed, so no key could abort.
-            self.reason = "aborted by a key" if os.read(sys.stdin.fileno(), 64) else "the terminal is gone"
+            self.reason = "aborted by a key" if os.read(sys.stdin.fileno(), 64) else "the terminal was closed"
         return self.reason

@@ -181,11 +181,11 @@ def _content(ran: ExperimentRun[PlaybackResult]) -> dict[str, object]:
 def _parts(ran: ExperimentRun[PlaybackResult], result: PlaybackResult, log: Path) -> tuple[Part, ...]:
     from dxlrun.tooling.output import Column, Table, numbers
 
-    end = "played" if result.whole else "played in part"
+    end = "played" if result.whole else "partly played"
     rows = [
         (one.name, round(math.degrees(one.rms), 2), round(math.degrees(one.worst), 2))
         for one in result.joints
     ]
-    columns = [Column("distance from what was sent", "name"), *numbers("rms, deg", "largest, deg")]
+    columns = [Column("distance from the sent goals", "name"), *numbers("rms, deg", "largest, deg")]
     left = (f"log: {ran.log}",) if ran.log is not None else ()
     return f"{ran.robot}: {end}, {result.seconds:.1f} s of {log}", Table.from_rows("", columns, rows), *left

@@ -60,14 +60,16 @@ def replay(
     """
     if played_on.on is not None:
         if settings:
-            raise InputError("--set is for the controllers of the log, and --on does not run them; omit one")
+            raise InputError(
+                "--set and --on exclude each other: --on does not run the controllers of the log; omit one"
+            )
         if code:
-            raise InputError("--code belongs to a replay without --on; omit one")
+            raise InputError("--code and --on exclude each other; omit one")
         chosen = RobotFileArguments(played_on.on, assignments, ())
         return play_recorded(log, chosen, played_on, part, as_json=as_json)
     _refuse_playing(played_on, part)
     if not log.exists():
-        raise InputError(f"there is no log {log}; a run prints the path of its log when it ends")
+        raise InputError(f"log {log} not found; a run prints the path of its log at its end")
     arguments = parse_assignments(assignments)
     import msgspec
 
@@ -77,9 +79,7 @@ def replay(
     warnings = [f"{report.robot}: {remark}" for remark in (*report.remarks, report.stopped) if remark]
     if report.unprepared:
         them = counted(report.unprepared, "command", "commands")
-        warnings.append(
-            f"{report.robot}: the log has no request of {them}, to prepare what was handed on again"
-        )
+        warnings.append(f"{report.robot}: {them} not prepared again, because the log lacks the requests")
     exit_code = 0 if report.same else 1
     if as_json:
         content = msgspec.to_builtins(report) | {"same": report.same, "sentence": report.sentence}
@@ -99,9 +99,7 @@ def _refuse_playing(played_on: PlaybackOptions, part: RecordedPart) -> None:
         if getattr(values, option.name) != getattr(usual, option.name)
     ]
     if given:
-        raise InputError(
-            f"{', '.join(given)}: only for a motion that is played; name the robot by --on ROBOT.yaml"
-        )
+        raise InputError(f"{', '.join(given)} can only be used with --on; add --on ROBOT.yaml")
 
 
 def _replayed(report: ReplayReport) -> tuple[Part, ...]:
@@ -112,7 +110,7 @@ def _replayed(report: ReplayReport) -> tuple[Part, ...]:
     counts = ["commands", "goals"]
     if any(joint.references for joint in report.joints):
         counts.insert(0, "references")
-    columns = [Column("cycles that differ", "name"), *numbers(*counts)]
+    columns = [Column("differing cycles", "name"), *numbers(*counts)]
     rows = [(joint.joint, *(getattr(joint, count) for count in counts)) for joint in report.joints]
     return report.sentence, _first(report.first), Table.from_rows("", columns, rows)
 

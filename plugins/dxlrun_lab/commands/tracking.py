@@ -77,7 +77,7 @@ def tracking(
 
     found = chosen([name.strip() for name in setups.split(",") if name.strip()])
     if not found:
-        raise InputError(f"--setups names no set-up; there are {_NAMES}")
+        raise InputError(f"--setups is empty; choose from {_NAMES}")
     prepared = compiled(file, words, [motion], None, read_models)
     require_right(found, prepared.plan)
     for warning in prepared.warnings:

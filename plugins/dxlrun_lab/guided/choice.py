@@ -49,7 +49,7 @@ def parse_ranges(words: Sequence[str]) -> dict[str, tuple[float, float]]:
         ranges[joint] = (lower, upper)
         if upper - lower < LEAST_WIDTH:
             mistakes.append(
-                f"--range {word}: the range must grow, by {math.degrees(LEAST_WIDTH):g} deg at least"
+                f"--range {word}: set HIGHEST at least {math.degrees(LEAST_WIDTH):g} deg above LOWEST"
             )
     if mistakes:
         raise InputError("\n".join(mistakes))
@@ -75,7 +75,7 @@ def check_joints(
     ]
     mistakes += [f"joint {name} is named twice; name it once" for name, n in Counter(names).items() if n > 1]
     mistakes += [
-        f"--range {name}: that joint takes no part in the experiment; name it too"
+        f"--range {name}: joint {name} is not in the experiment; name the joint, too"
         for name in ranges
         if name in plans and name not in names
     ]
@@ -137,18 +137,17 @@ def require_own_servos(plan: Plan, names: Sequence[str], command: str, *, gears:
 
     `command` is the name for the message.
     """
-    alone = f"`dxlrun {command}` measures one servo: describe it as a joint of its own in another robot file"
+    alone = f"but `dxlrun {command}` measures one servo; describe it as a rotary joint of another robot file"
     mistakes = []
     for joint in plan.loop.joints:
         servos = plan.servos_by_joint[joint.name] if joint.name in names else ()
         if len(servos) > 1:
-            mistakes.append(f"{joint.name} has {len(servos)} servos ({joint.servo}); {alone}")
+            mistakes.append(f"{joint.name} has {len(servos)} servos ({joint.servo}), {alone}")
         elif servos and joint.unit is LINEAR:
-            mistakes.append(f"{joint.name} is linear; {alone} that turns")
+            mistakes.append(f"{joint.name} is linear, {alone}")
         elif servos and servos[0][1].ratio != 1.0 and not gears:
             mistakes.append(
-                f"{joint.name} has a gear of {1 / servos[0][1].ratio:g} : 1; {alone} without gear_ratio, "
-                "since its torques are those at the horn"
+                f"{joint.name} has a gear of {1 / servos[0][1].ratio:g} : 1, {alone} without gear_ratio"
             )
     if mistakes:
         raise InputError("\n".join(mistakes))
@@ -162,9 +161,9 @@ def _taken(rig: Rig, names: Sequence[str], controllers: Sequence[RunningControll
         return [f"{robot} is paused; resume it first: dxlrun resume --robot {robot}"]
     if other := [one.name for one in controllers if one.name.startswith(f"{PLAYER}_")]:
         return [
-            f"another experiment works on {robot} ({other[0]} is loaded); wait for its end; of one that "
-            f"was killed, deactivate and unload it: dxlrun switch --deactivate {other[0]}, dxlrun pause, "
-            f"dxlrun unload {other[0]}, dxlrun resume"
+            f"another experiment uses {robot} ({other[0]} is loaded); wait for its end. "
+            f"If it was killed, run `dxlrun switch --deactivate {other[0]}`, `dxlrun pause`, "
+            f"`dxlrun unload {other[0]}`, `dxlrun resume`"
         ]
     if rig.own:
         return []
@@ -200,10 +199,7 @@ def _range_problem(plan: JointPlan, given: tuple[float, float] | None) -> str:
     if given is None:
         if math.isfinite(lower) and math.isfinite(upper) and not plan.continuous:
             return ""
-        return (
-            f"joint {plan.name} has no position limits, so its range must be given: "
-            f"--range {plan.name}=-30deg..30deg"
-        )
+        return f"joint {plan.name} has no position limits; give --range, such as {plan.name}=-30deg..30deg"
     if given[0] >= lower - _SLACK and given[1] <= upper + _SLACK:
         return ""
     shown = f"{math.degrees(given[0]):.4g}..{math.degrees(given[1]):.4g} deg"
@@ -218,8 +214,7 @@ def _range_of(plan: JointPlan, now: JointNow, given: tuple[float, float] | None)
     name, position = plan.name, now.position
     if now.torque not in TORQUED:
         raise ValueError(
-            f"joint {plan.label} is {now.torque}, so it cannot be moved; switch its torque on first: "
-            f"dxlrun torque on {name}"
+            f"joint {plan.label} is {now.torque}; enable its torque first: dxlrun torque on {name}"
         )
     if math.isnan(position):
         raise ValueError(f"joint {plan.label} has not answered yet")
@@ -227,8 +222,8 @@ def _range_of(plan: JointPlan, now: JointNow, given: tuple[float, float] | None)
     if given is not None and given[0] <= position <= given[1]:
         return *given, "--range"
     if given is not None and given != _within_all(plan):
-        raise ValueError(f"{at} its --range; lead it inside first, or choose another")
+        raise ValueError(f"{at} its --range; move the joint inside first")
     low, high = max(lower, position - DEFAULT_REACH), min(upper, position + DEFAULT_REACH)
     if given is not None or high - low < LEAST_WIDTH or not low <= position <= high:
-        raise ValueError(f"{at} its limits of {_degrees(lower, upper)}; lead it inside first")
+        raise ValueError(f"{at} its limits of {_degrees(lower, upper)}; move the joint inside first")
     return low, high, range_text(plan, None)

@@ -251,7 +251,7 @@ class _Stage:
             )
             if outcome != "reached":
                 # A goal that the runtime ended has no text, but the state of its joint may have the reason.
-                text = self._find_abort_reason() or text or f"the samples were {outcome}"
+                text = self._find_abort_reason() or text or f"the goal of the samples was {outcome}"
         except RunGone as gone:
             text = str(gone)
         cycles = self.rig.recorded(goal)
@@ -282,7 +282,7 @@ class _Stage:
         goal = self._send(segment)
         outcome, text = self.rig.wait_for_goal(goal, self._find_abort_reason, segment.duration_s + _EXTRA_S)
         if outcome != "reached":
-            raise _EarlyEnd(text or f"the way to the start was {outcome}")
+            raise _EarlyEnd(text or f"the goal of the approach was {outcome}")
 
     def _send(self, segment: Segment) -> int:
         """Send a segment's table to the active sample_player, in pieces that fit into a cycle. Returns the
@@ -348,7 +348,7 @@ class _Stage:
         for joint in self.situation.joints:
             without = [each for each in joint.servos if mode not in [plan.mode for plan in each.modes]]
             if without:
-                text = f"joint {joint.plan.label} has no {interface} mode, as an {without[0].model} has none"
+                text = f"joint {joint.plan.label} has no {interface} mode: {without[0].model} lacks the mode"
                 raise _UnfitSegment(Refused(text, code="no_mode"))
 
     # What ends it early
@@ -384,7 +384,7 @@ class _Stage:
                 except DxlrunError as error:
                     problems += error.sentences
         except RunGone as gone:
-            problems.append(f"{gone}, so nothing could be put back")
+            problems.append(f"{gone}, so the run was not restored")
         return tuple(dict.fromkeys(problems))
 
     def _steps_back(self) -> Iterator[Callable[[], None]]:

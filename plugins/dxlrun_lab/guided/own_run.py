@@ -61,7 +61,7 @@ class OwnRun:
         until = time.monotonic() + START_S
         while abort() is None:
             if self._process.poll() is not None:
-                raise ProcessFault("\n".join(self._sentences()) or "the run ended before it began")
+                raise ProcessFault("\n".join(self._sentences()) or "the run ended during its start")
             for name, path in sockets().items():
                 if _parent_of_listener(path) == self._process.pid:
                     robot = RemoteRobot(name, SocketLink(path, "experiment"))
@@ -69,7 +69,7 @@ class OwnRun:
                         return robot
                     robot.close()
             if time.monotonic() > until:
-                raise ProcessFault(f"the run did not begin within {START_S:g} s")
+                raise ProcessFault(f"the run did not start within {START_S:g} s")
             time.sleep(_POLL_S)
         return None
 

@@ -96,7 +96,7 @@ class Rig:
         except (Refused, RunGone):
             raise
         except DxlrunError as error:
-            raise RunGone(f"the run of {self.robot.name} ended, or its gateway did ({error})") from error
+            raise RunGone(f"the run of {self.robot.name} or its gateway ended ({error})") from error
 
     def _info(self) -> dict[str, object]:
         with self._asking() as robot:
@@ -260,7 +260,7 @@ def live_rig(robot: RemoteRobot, run: OwnRun | None = None) -> Rig:
     log = robot.info()["log"]
     if log is None:
         raise InputError(
-            f"{robot.name} records no log, but an experiment needs it; start it without --no-record"
+            f"{robot.name} records no log, but an experiment needs a log; start the robot without --no-record"
         )
     follower = LogFollower(str(log))
     plan = from_json(follower.new().attachments["plan.json"])
@@ -280,6 +280,6 @@ def require_whole(recording: RecordingPlan, robot: str) -> None:
     """
     if recording.keep_ns is not None:
         raise InputError(
-            f"{robot} deletes the oldest parts of its log, and an experiment takes what it measures from the "
-            "log; remove `keep` from its `recording`"
+            f"{robot} deletes the oldest parts of its log, but an experiment needs the whole log; "
+            "remove `keep` from its `recording`"
         )

@@ -52,11 +52,13 @@ class Segment(msgspec.Struct, frozen=True):
         """Raise ValueError if rows are missing, have different lengths, or are not finite."""
         lengths = {len(values) for values in (*self.rows.values(), *self.speeds.values())}
         if len(lengths) != 1 or 0 in lengths:
-            raise ValueError(f"{self.title}: each joint needs as many rows, at least one, not {lengths}")
+            raise ValueError(
+                f"{self.title}: all joints need the same number of rows, 1 or more, not {lengths}"
+            )
         if not all(np.isfinite(values).all() for values in (*self.rows.values(), *self.speeds.values())):
-            raise ValueError(f"{self.title}: a row has a number that is not finite")
+            raise ValueError(f"{self.title}: a number is not finite")
         if self.interface == "posvel" and set(self.speeds) != set(self.rows):
-            raise ValueError(f"{self.title}: posvel needs speeds of the same joints as positions")
+            raise ValueError(f"{self.title}: posvel needs a speed and a position for each joint")
 
     @property
     def count(self) -> int:

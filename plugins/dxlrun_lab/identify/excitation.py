@@ -78,8 +78,8 @@ def excitation(
         )
     if room.upper - room.lower < 2 * LEAST_RANGE:
         raise InputError(
-            f"{math.degrees(room.upper - room.lower):.1f} deg are too small a range to identify a servo; "
-            f"{math.degrees(2 * LEAST_RANGE):g} deg or more separate its motor from its friction"
+            f"a range of {math.degrees(room.upper - room.lower):.1f} deg is too small to identify a servo; "
+            f"give {math.degrees(2 * LEAST_RANGE):g} deg or more"
         )
     random = np.random.default_rng(seed)
     counts = {name: round(share * seconds / period_s) for name, share in _SHARES.items()}

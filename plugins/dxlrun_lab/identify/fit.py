@@ -462,9 +462,8 @@ def _require_followed(run: JointRecording, fit: Fit) -> None:
     """Raise InputError if the simplest model fits so badly that the joint did not follow its goals."""
     if fit.position_rms > _FAR * run.moved:
         raise InputError(
-            f"{run.servo.joint}: no model of a servo follows this run ({fit.position_rms:.2g} of "
-            f"{run.moved:.2g} rad off): something else moved the joint, its direction is wrong, or its "
-            "goals are those of another one"
+            f"{run.servo.joint}: no servo model fits this run (error {fit.position_rms:.2g} rad, motion "
+            f"{run.moved:.2g} rad); check for an external force, a wrong direction, or goals of another joint"
         )
 
 
@@ -474,6 +473,6 @@ def _require_determined(run: JointRecording, fit: Fit) -> None:
     part = fit.student * np.sqrt(fit.variance("drive")) / fit.numbers.drive
     if part > _LOOSE:
         raise InputError(
-            f"{name}: this run does not determine its motor (the torque for a volt is known to {part:.0%} "
-            f"only): it has too few accelerations; run `dxlrun identify {name}`"
+            f"{name}: this run has too few accelerations (torque per volt known to {part:.0%} only); "
+            f"run `dxlrun identify {name}`"
         )

@@ -62,8 +62,8 @@ class Identification(msgspec.Struct, frozen=True):
         """
         if situation.rate < _LEAST_RATE:
             raise InputError(
-                f"the loop's rate is {situation.rate:g} Hz, and a motor takes {_LEAST_RATE:g} Hz to be "
-                "seen; raise it"
+                f"the loop rate of {situation.rate:g} Hz is too low to identify a motor; raise it to "
+                f"{_LEAST_RATE:g} Hz or more"
             )
         require_own_servos(situation.plan, situation.names, "identify", gears=False)
         for joint in situation.joints:

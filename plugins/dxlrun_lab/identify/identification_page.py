@@ -40,7 +40,7 @@ def page(robot: str, results: Sequence[JointResult]) -> str:
         ],
     )
     sections = [_section(number, each, result) for number, (each, result) in enumerate(found)]
-    end = footer("The numbers of this page are in it as JSON, in the element with the identifier report.")
+    end = footer("The element with the ID report contains the numbers of this page as JSON.")
     return document(f"{robot}: identified servos", top, sections, end, [result for _, result in found])
 
 
@@ -73,7 +73,7 @@ def _fit(number: int, result: IdentifiedServo, curve: FitCurve) -> Element:
         f"{result.joint}: fit and residual",
         f"Position in rad and the difference in mrad over the time in s; {rms:.2f} mrad RMS.",
         "The model is simulated from the commands alone, second by second; every fifth second was held out "
-        f"of the fit. What is left is {rms:.2f} mrad RMS, and {held_out:.2f} mrad in what was held out.",
+        f"of the fit. The residual is {rms:.2f} mrad RMS, and {held_out:.2f} mrad in the held-out seconds.",
         4.0,
         draw_fit,
     )

@@ -8,15 +8,15 @@ from dxlrun.tooling.output import Cell, Column, Part, Sentence, Table
 from dxlrun_lab.identify.result import IdentifiedServo, IdentifiedValue
 
 _NAMES = {
-    "torque_constant_with_viscous_friction": "torque constant, viscous friction in it",
-    "torque_per_measured_ampere": "torque for a measured A",
+    "torque_constant_with_viscous_friction": "torque constant, with viscous friction",
+    "torque_per_measured_ampere": "torque per measured ampere",
     "load_gravity": "weight, horizontal",
-    "load_gravity_angle": "weight hangs at",
+    "load_gravity_angle": "angle of the weight",
 }
 _MODELS = {
     "m1": "Coulomb and viscous friction",
-    "m3": "friction that grows with the load",
-    "m4": "friction that grows with the load, and more near standstill",
+    "m3": "load-dependent friction",
+    "m4": "load-dependent friction with Stribeck effect",
 }
 
 
@@ -25,10 +25,10 @@ def parts(result: IdentifiedServo) -> tuple[Part, ...]:
     degrees = math.degrees(result.position_rms), math.degrees(result.held_out_rms)
     lines = [
         f"{'* ' if result.scale == 'manual' else ''}{result.scale_sentence}",
-        f"friction model {result.friction_model} ({_MODELS[result.friction_model]}): chosen by BIC and by "
-        f"the error in what was held out, of {_candidates(result)}",
-        f"the model follows {result.seconds:.0f} s to {degrees[0]:.3f} deg RMS, and what was held out to "
-        f"{degrees[1]:.3f} deg; intervals are linearised, of residuals that hang together within a second",
+        f"friction model {result.friction_model} ({_MODELS[result.friction_model]}): chosen by BIC and "
+        f"held-out error from {_candidates(result)}",
+        f"the model follows {result.seconds:.0f} s to {degrees[0]:.3f} deg RMS, and the held-out seconds to "
+        f"{degrees[1]:.3f} deg; intervals are linearised, with residuals correlated within a second",
         *result.notes,
     ]
     return (values_table(result), *(Sentence(f"  {line}") for line in lines))

@@ -111,8 +111,8 @@ def measured(
     usable = _usable(cycles, row)
     if not usable.any():
         raise InputError(
-            f"{name}: never under torque with a goal position or PWM in this log, so there is nothing to "
-            "identify; command it, or take the log of another run"
+            f"{name}: never under torque with a goal position or PWM in this log; "
+            "use the log of a run with commands to this joint"
         )
     volts = _voltage(cycles, row, voltage, name)
     time_s = (cycles["read_ns"] - np.maximum(cycles["age_ns"][:, row], 0)) * 1e-9
@@ -130,8 +130,8 @@ def measured(
     seconds = float(sum(sent_s[span.stop - 1] - sent_s[span.start] for span in spans))
     if seconds < _LEAST_S:
         raise InputError(
-            f"{name}: only {seconds:.1f} s of this log are usable (under torque, read, with a goal), and an "
-            f"identification takes at least {_LEAST_S:g} s; record a longer run"
+            f"{name}: only {seconds:.1f} s of this log are usable (under torque, read, with a goal); "
+            f"record a run of at least {_LEAST_S:g} s"
         )
     _require_motion(name, time_s[fresh], position[fresh], servo)
     run = JointRecording(
@@ -153,7 +153,9 @@ def measured(
         group = _compared(run, sent, chosen, servo.control(by_position=mode))
         groups += [group] if group is not None else []
     if not groups:
-        raise InputError(f"{name}: too few samples arrived in this log; look at `dxlrun analyze`")
+        raise InputError(
+            f"{name}: too few samples arrived in this log; run `dxlrun analyze` to find the cause"
+        )
     return replace(run, groups=tuple(groups))
 
 
@@ -184,8 +186,8 @@ def _voltage(cycles: NDArray[np.void], row: int, given: float | None, name: str)
     known = np.flatnonzero(np.isfinite(read))
     if not len(known):
         raise InputError(
-            f"{name}: this log has no voltage of its servo, so the torque of a duty is unknown; record it "
-            "with the default `slow_registers`, or give the voltage: --voltage 12"
+            f"{name}: this log has no supply voltage of the servo; give the voltage, such as --voltage 12, "
+            "or record with the default `slow_registers`"
         )
     t = cycles["woken_ns"] * 1e-9
     t = t - t[0]
@@ -244,7 +246,7 @@ def _require_motion(name: str, time_s: Floats, position: Floats, servo: Servo) -
     """Raise InputError if the joint hardly moved, or moved at a single speed."""
     if not len(position) or np.ptp(position) < _LEAST_MOVED * servo.tick:
         raise InputError(
-            f"{name}: never moved in this log (by {_LEAST_MOVED} ticks), so nothing of its motor shows; "
+            f"{name}: never moved by {_LEAST_MOVED} ticks or more in this log; "
             f"run `dxlrun identify {name}` to move it"
         )
     velocity = _slopes(time_s, position, time_s)

@@ -105,13 +105,13 @@ class Servo(msgspec.Struct, frozen=True):
         for name in ("position_i_gain", "i_gain"):
             if self.register(name):
                 raise InputError(
-                    f"{self.joint} has {name} {self.register(name)}, and an integral part is not modelled; "
+                    f"{self.joint} has {name} {self.register(name)}, but the model has no integral gain; "
                     f"declare `registers: {{{name}: 0}}` and measure again"
                 )
         for name in ("profile_acceleration", "goal_acceleration"):
             if self.register(name):
                 raise InputError(
-                    f"{self.joint} has {name} {self.register(name)}: its way to a goal is not the goal; "
+                    f"{self.joint} has {name} {self.register(name)}, but the model has no profile; "
                     f"declare `registers: {{{name}: 0}}` and measure again"
                 )
         items, p = self.table.items, self.p_gain
@@ -154,7 +154,7 @@ def servos_in(log: Log, joints: Sequence[str]) -> list[Servo]:
     try:
         plan = from_json(log.attachments.get("plan.json", b"{}"))
     except UNREADABLE as error:
-        raise InputError(f"{log.path}: its plan with its joints cannot be read: {error}") from error
+        raise InputError(f"{log.path}: the plan in the log cannot be read: {error}") from error
     require_own_servos(plan, joints, "identify", gears=False)
     try:
         return [servo_of(plan, joint) for joint in joints]

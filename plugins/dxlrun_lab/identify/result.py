@@ -161,21 +161,22 @@ def identified(run: JointRecording, fits: tuple[Fit, ...], load: KnownLoad, sour
 
 def _scale_of(fit: Fit, servo: Servo, load: KnownLoad) -> tuple[Scale, str]:
     if load.gravity:
-        return "load", f"torques are from the known weight of the load, {load.gravity:g} Nm"
+        return "load", f"torques are scaled by the known weight of the load, {load.gravity:g} Nm"
     if "resistance" in fit.free:
         return (
             "current",
-            "torques are from the measured current, a torque constant being as many Nm/A as V s/rad",
+            "torques are scaled by the measured current, because a torque constant has the same value in "
+            "Nm/A and V s/rad",
         )
     if servo.table.stall_torque and servo.table.nominal_voltage:
         return "manual", (
-            f"torques are from the manual's stall torque, {servo.table.stall_torque:g} Nm at "
-            f"{servo.table.nominal_voltage:g} V; no interval contains its error; "
-            "--load-gravity gives them their own scale"
+            f"torques are scaled by the manual's stall torque, {servo.table.stall_torque:g} Nm at "
+            f"{servo.table.nominal_voltage:g} V, and the intervals exclude its error; "
+            "give --load-gravity to scale them by a known weight"
         )
     raise InputError(
-        f"{servo.joint}: an {servo.table.model} measures no current, and its manual gives no stall torque, "
-        "so nothing says how large a torque is; hang a known weight on it and give --load-gravity"
+        f"{servo.joint}: the scale of torques is unknown, because {servo.table.model} has no measured "
+        "current and no stall torque in its manual; attach a known weight and give --load-gravity"
     )
 
 
@@ -286,28 +287,29 @@ def _notes(  # noqa: PLR0917  all that a sentence may be about
     notes = []
     if servo.p_gain_item is not None and servo.p_gain_item not in servo.declared:
         notes.append(
-            f"{servo.p_gain_item} is taken as shipped, {servo.p_gain}: the robot file does not declare it"
+            f"{servo.p_gain_item} is assumed to have its factory value, {servo.p_gain}: "
+            "the robot file does not declare it"
         )
     if "gain" not in fit.free:
         _, where = servo.expected_gain()
         notes.append(
-            f"position_gain was taken from {where}: the duty never reached its limit and is not measured, so "
-            "torque constant and resistance go with it"
+            f"position_gain is from {where}, because the duty never reached its limit and is not measured; "
+            "an error of this gain is also in torque constant and resistance"
         )
     if "viscous_friction" not in fit.free:
         notes.append(
-            "without a measured current, viscous friction and back-EMF are one: torque constant and "
-            "resistance have both, so has what they are compared with; the motor file's interval has the "
-            f"share of such motors, {_viscous_share(servo):.1%}"
+            "without a measured current, viscous friction and back-EMF cannot be separated: torque constant, "
+            "resistance and their expected values contain both; the motor file's interval includes the usual "
+            f"share of viscous friction, {_viscous_share(servo):.1%}"
         )
     if load.inertia is None:
-        notes.append("inertia is that of the motor and of what it moves; --load-inertia separates them")
+        notes.append("the inertia includes motor and load; give --load-inertia to separate them")
     if scale == "load" and "resistance" in fit.free:
         ampere = values["torque_per_measured_ampere"] / values["torque_constant"]
         if abs(ampere - 1.0) > 0.1:
             notes.append(
-                f"the measured current gives {ampere:.2f} x the torque that the back-EMF says: the servo "
-                "measures another current than that of its motor, or its gear loses that part"
+                f"the measured current gives {ampere:.2f} x the torque of the back-EMF: the servo does not "
+                "measure the motor current, or the gear has losses"
             )
     names = list(values)
     spread = np.sqrt(np.maximum(np.diag(covariance), 1e-30))
@@ -315,13 +317,13 @@ def _notes(  # noqa: PLR0917  all that a sentence may be about
         i, j = names.index(first), names.index(second)
         both = {first, second} <= _fitted_names(fit)
         if both and abs(covariance[i, j] / (spread[i] * spread[j])) > _CORRELATED:
-            notes.append(f"{first} and {second} are hardly told apart in this run: their sum is known better")
+            notes.append(f"{first} and {second} are hardly separable in this run; their sum is more exact")
     if run.lost_s > 0.05 * run.seconds:
         notes.append(f"{run.lost_s:.1f} s of the run were skipped: limp, lost, or in another mode")
     if fit.held_out_rms > 1.5 * fit.position_rms:
         notes.append(
-            f"the model is worse in what was held out ({fit.held_out_rms:.2g} rad) than in what was fitted "
-            f"({fit.position_rms:.2g} rad): the servo changed during the run, or something else moved it"
+            f"the error in held-out seconds ({fit.held_out_rms:.2g} rad) exceeds that of the fit "
+            f"({fit.position_rms:.2g} rad): the servo changed during the run, or an external force moved it"
         )
     return notes
 

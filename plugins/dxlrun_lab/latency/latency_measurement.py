@@ -69,8 +69,8 @@ def compiled_yardstick(settings: Settings) -> Iterator[str]:
     compiler = shlex.split(os.environ.get("CC") or shutil.which("cc") or shutil.which("gcc") or "")
     if not compiler:
         raise InputError(
-            "the yardstick c is compiled on the spot, and there is no C compiler cc; install one (Debian, "
-            "Ubuntu: `sudo apt install gcc`), or omit c of --compare"
+            "c of --compare needs the C compiler cc; install a compiler (Debian, Ubuntu: `sudo apt install "
+            "gcc`), or omit c"
         )
     with tempfile.TemporaryDirectory(prefix="dxlrun-latency-") as folder:
         target = Path(folder) / "yardstick"
@@ -83,11 +83,11 @@ def compiled_yardstick(settings: Settings) -> Iterator[str]:
             )
         except OSError as error:
             raise InputError(
-                f"the yardstick c was not compiled, {compiler[0]} cannot be run: {error.strerror or error}"
+                f"c of --compare was not compiled, {compiler[0]} did not run: {error.strerror or error}"
             ) from error
         if built.returncode:
             first = (built.stderr.strip().splitlines() or ["no reason given"])[0]
-            raise InputError(f"the yardstick c was not compiled: {first}")
+            raise InputError(f"c of --compare was not compiled: {first}")
         program = create_file("yardstick", target.read_bytes())
     try:
         yield f"/proc/{os.getpid()}/fd/{program}"
@@ -230,11 +230,11 @@ class _Process:
         try:
             code = self._process.wait(_STANDSTILL_S)
         except subprocess.TimeoutExpired:
-            raise ProcessFault(f"the process that measures {self._condition.label} does not end") from None
+            raise ProcessFault(f"the measuring process of {self._condition.label} did not exit") from None
         if code:
             last = (read_file(self._errors).decode(errors="replace").strip().splitlines() or [""])[-1]
             how = signal.Signals(-code).name if code < 0 else last or f"exit code {code}"
-            raise ProcessFault(f"the process that measures {self._condition.label} ended ({how})")
+            raise ProcessFault(f"the measuring process of {self._condition.label} exited ({how})")
 
     def grants(self) -> tuple[Grant, ...]:
         """Return for each requested setting whether the operating system granted it."""

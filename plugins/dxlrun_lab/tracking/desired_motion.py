@@ -58,16 +58,14 @@ def desired_motion(path: Path, plan: Plan) -> DesiredMotion:
     commands = plan.loop.commands
     joints = next(one.joints for one in plan.loop.controllers if one.name == commands[0].controller)
     if parts != 1 or len(joints) != 1:
-        what = f"{parts} parts" if parts != 1 else f"one of {len(joints)} joints"
+        what = f"{parts} parts" if parts != 1 else f"{len(joints)} joints"
         raise InputError(
-            f"the experiment compares how one joint follows one motion, and {path} has {what}; "
-            "give a motion file with one part that moves one joint"
+            f"{path} has {what}, but the experiment needs one motion of one joint; "
+            "give a motion file with one part and one joint"
         )
     points, lead_ns = _points(commands)
     if len(points) < 2 or not points[0].positions:
-        raise InputError(
-            f"the experiment compares positions, and {path} has not two of them; give --play another motion"
-        )
+        raise InputError(f"{path} has fewer than two positions; choose another motion for --play")
     times = np.array([point.time_ns - points[0].time_ns for point in points]) * 1e-9
     positions = np.array([point.positions[0] for point in points], np.float64)
     given = np.array([point.velocities[0] if point.velocities else np.nan for point in points])

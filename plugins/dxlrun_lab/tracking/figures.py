@@ -88,7 +88,7 @@ class _SetupPlot(msgspec.Struct, frozen=True):
         """Draw the figure with title and caption."""
         tracked, curves = self.measured.tracked, self.measured.curves
         latest = (
-            f"the latest, by {microseconds(float(curves.late_us[curves.worst]))}, at "
+            f"the worst {microseconds(float(curves.late_us[curves.worst]))} late, at "
             f"{float(curves.woken_s[curves.worst]):.2f} s"
         )
         late = f"{counted(tracked.late_cycles, 'late cycle', 'late cycles')} of {tracked.cycles}, {latest}"
@@ -96,9 +96,9 @@ class _SetupPlot(msgspec.Struct, frozen=True):
             tracked.setup,
             f"{tracked.title[0].upper()}{tracked.title[1:]}",
             "Position in rad (desired, sent, read), velocity in rad/s and lateness of "
-            f"{self.motion.joint} over the time since the motion began, s: {late}.",
-            f"{late}. Red: from when a late cycle was due to when it began. Desired is where the joint "
-            "should be by the clock; sent is the goal that was written last. The thesis has "
+            f"{self.motion.joint} over the time since the start of the motion, s: {late}.",
+            f"{late}. Red: from the deadline of a late cycle to its start. Desired is the position of the "
+            "motion at this time; sent is the last written goal. The thesis has "
             f"{tracked.thesis}.",
             7.4,
             self._fill,

@@ -54,7 +54,7 @@ def chosen(names: Sequence[str]) -> tuple[Setup, ...]:
     """Return the set-ups with these names, in the order of SETUPS. Raises InputError for an unknown name."""
     for name in names:
         if name not in _BY_NAME:
-            raise InputError(f"there is no set-up {name!r}; {suggestion(name, tuple(_BY_NAME))}")
+            raise InputError(f"unknown set-up {name!r}; {suggestion(name, tuple(_BY_NAME))}")
     return tuple(setup for setup in SETUPS if setup.name in names)
 
 
@@ -67,6 +67,6 @@ def require_right(setups: Sequence[Setup], plan: Plan) -> None:
     refused = " and ".join(one.name for one in real_time)
     normal = ",".join(one.name for one in SETUPS if not one.real_time)
     raise InputError(
-        f"real-time priority is needed for {refused}, and this user has no right to it: allow it with "
-        f"`{missing[0]}` and log in again, or measure the others with --setups {normal}"
+        f"this user may not use real-time priority, required by {refused}; run `{missing[0]}` and log in "
+        f"again, or omit {refused} with --setups {normal}"
     )

@@ -99,16 +99,16 @@ def sentences(experiment: TrackingExperiment) -> list[str]:
 def _of_sequence(one: SetupFigures) -> str:
     if one.drift_ns is None or one.start_delays_ns is None or not one.adds_up:
         return f"{one.setup}: the log lacks cycles, so its delays do not add up."
-    bus = "" if one.late_by_bus_us is None else " with what the simulated bus was late"
+    bus = "" if one.late_by_bus_us is None else " (with the delay of the simulated bus)"
     return (
-        f"{one.setup}: ended {microseconds(one.drift_ns / 1e3)} late{bus}, which is the sum of its start "
-        f"delays to the nanosecond ({one.start_delays_ns} ns in {one.cycles - 1} poses)."
+        f"{one.setup}: ended {microseconds(one.drift_ns / 1e3)} late{bus}, exactly the sum of its start "
+        f"delays ({one.start_delays_ns} ns in {one.cycles - 1} poses)."
     )
 
 
 def _of_loop(one: SetupFigures) -> str:
     drift, late = (microseconds(max(0, ns) / 1e3) for ns in (one.drift_ns or 0, one.last_late_ns))
-    return f"{one.setup}: ended {drift} late, in the first cycle at the motion's end, itself {late} late."
+    return f"{one.setup}: ended {drift} late; the final cycle started {late} late."
 
 
 def page(experiment: TrackingExperiment) -> str:
@@ -129,15 +129,18 @@ def page(experiment: TrackingExperiment) -> str:
     facts = Table.facts(
         "",
         (
-            ("drift", "how much longer it took than the motion is"),
-            ("error", "desired minus read position, desired being that of the moment of the reading"),
-            ("late", "cycles that began more than 150 us after the first deadline behind the one before"),
+            ("drift", "measured duration minus duration of the motion"),
+            ("error", "desired minus read position, both at the time of reading"),
+            (
+                "late",
+                "cycles with a start more than 150 us after the first deadline following the previous cycle",
+            ),
             ("mean, largest late", "of the late cycles"),
-            ("no reply", "cycles in which the joint's servo gave no intact one"),
+            ("no reply", "cycles without an intact reply of the joint's servo"),
             (
                 "simulated bus",
-                "how late simulated servos made the cycles, by the ledger; of the other columns only the "
-                "duration has it, and so have the sentences above",
+                "delay of cycles by simulated servos, from the ledger; of the other columns, only duration "
+                "includes it, as do the sentences above",
             ),
         ),
     )

@@ -137,7 +137,7 @@ def _only(line: str, joint: str, *, speed: bool) -> str:
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["a.mcap"], "a motion file is YAML, so its name ends in .yaml, not as a.mcap does"),
+        (["a.mcap"], "motion file a.mcap does not end in .yaml; choose another name"),
         (["none/a.yaml"], "there is no directory none"),
         (["a.yaml", "--joint", "pan"], "a motion file needs all joints of both; convert tilt too"),
         (

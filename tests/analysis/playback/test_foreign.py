@@ -85,7 +85,7 @@ def test_it_is_played_on_a_robot_with_other_names(foreign: Path, place: Path, dx
     words = ["replay", foreign, "--on", "pair.yaml", "--virtual", "--joint", "tilt", "--map", "tilt=pan"]
     done = dxlrun(*words)
     assert (done.code, "pair: played, 2.8 s of" in done.out) == (0, True), done
-    assert "0 joints as they were sent, 1 as measured" in done.err
+    assert "0 joints by sent goals, 1 by measured positions" in done.err
 
 
 @pytest.mark.parametrize("storage", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])

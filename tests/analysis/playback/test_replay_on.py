@@ -48,7 +48,7 @@ def test_the_recorded_goals_are_sent_again(swing: Path, place: Path, dxlrun: Dxl
     result = result_of(done.out)
     assert result["whole"]
     assert [one["name"] for one in result["joints"]] == ["pan", "tilt"]
-    assert "first pose: pan (ID 1 on bus main) has the longest way, 0.0 deg, at up to" in done.err
+    assert "first pose: pan (ID 1 on bus main) moves farthest, 0.0 deg, at up to" in done.err
     for joint in ("pan", "tilt"):
         time_s, sent = goals(read_log(swing), joint)
         again_s, again = goals(played(result), joint)
@@ -150,9 +150,7 @@ def test_wrong_words_are_refused(
 
 def test_options_of_playing_need_a_robot(swing: Path, dxlrun: Dxlrun) -> None:
     (line,) = refused(dxlrun, swing, "--speed", "2", "--from", "1")
-    assert (
-        line == "dxlrun: --speed, --from: only for a motion that is played; name the robot by --on ROBOT.yaml"
-    )
+    assert line == "dxlrun: --speed, --from can only be used with --on; add --on ROBOT.yaml"
 
 
 def test_no_log_an_empty_one_and_a_directory(place: Path, dxlrun: Dxlrun) -> None:
@@ -174,12 +172,12 @@ def test_real_joints_are_asked_about_before_a_run_is_started(
         done = dxlrun("replay", swing, "--on", "real.yaml")
     assert (done.code, done.out) == (2, "")
     assert (
-        f"2 joints will be led to the first pose at up to 29 deg/s, and then play 4.5 s of {swing}: "
+        f"2 joints will move to the first pose at up to 29 deg/s, and then play 4.5 s of {swing}; "
         in done.err
     )
-    assert "moves 46 deg, pan at up to 9" in done.err
-    assert "pair is started for it, and switches torque on as its file says" in done.err
-    assert "nothing was moved; add --yes" in done.err
+    assert "46 deg; fastest: pan, 9" in done.err
+    assert "pair will start now and enable torque as in its file" in done.err
+    assert "(nothing was moved); add --yes" in done.err
 
 
 def test_joints_are_led_slowly_to_a_first_pose_that_is_far(swing: Path, place: Path, dxlrun: Dxlrun) -> None:
@@ -187,7 +185,7 @@ def test_joints_are_led_slowly_to_a_first_pose_that_is_far(swing: Path, place: P
     widest = int(np.abs(sent).argmax())
     done = dxlrun("replay", swing, "--on", "pair.yaml", "--virtual", "--json", "--from", time_s[widest])
     assert done.code == 0, done
-    assert "first pose: tilt (ID 2 on bus main) has the longest way, 34.3 deg, at up to 29 deg/s" in done.err
+    assert "first pose: tilt (ID 2 on bus main) moves farthest, 34.3 deg, at up to 29 deg/s" in done.err
     _, again = goals(played(result_of(done.out)), "tilt")
     there = int(np.argmax(np.abs(again - sent[widest]) < np.radians(0.15)))
     speed = np.abs(again[10 : there + 1] - again[: there - 9]) / 0.1  # a row of that way lasts two cycles

@@ -65,7 +65,7 @@ def test_remarks_go_to_stderr(
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["missing.mcap"], "there is no log missing.mcap"),
+        (["missing.mcap"], "log missing.mcap not found"),
         ([__file__], "this is not an MCAP file"),
         (["{log}", "fast"], "'fast' is not an argument of the robot file"),
         (["{log}", "--set", "neck.gain=1"], "the log has no such controller"),

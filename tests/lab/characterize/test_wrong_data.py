@@ -52,7 +52,7 @@ def test_noise_widens_the_interval_until_nothing_is_told():
     assert noisy[1].uncertainty > quiet[1].uncertainty
     first, rise = response.response(stepping(0.05))
     assert (first.value, rise.value) == (None, None)
-    assert "steps were recorded in which the joint rested before; 6 are needed" in first.why
+    assert "steps started at rest; 6 are needed" in first.why
 
 
 @pytest.mark.parametrize(
@@ -74,13 +74,13 @@ def test_a_figure_that_is_not_told_from_0_is_an_upper_bound(value, uncertainty, 
 def test_estimators_refuse_nothing_and_motions_without_motion():
     assert response.response([])[0].why.startswith("0 steps were recorded")
     still = [step_of(0.0, 0.1)] * 8
-    assert "the joint moved by 0 deg at most in steps of 5.7 deg" in response.response(still)[0].why
+    assert "the joint moved by only 0 deg in steps of 5.7 deg" in response.response(still)[0].why
     for figure in speeds.speeds(still, 1.0, 5.0):
         assert (figure.value, figure.why) == (None, "the joint hardly moved")
     assert dead_band.dead_band([], TICK, {}, TICK)[0].value is None
     assert gaps.longest_gap([], "position", 0.02, 0.004, 1.0).value is None
     kept = [gaps.GapResult(gap / 100, 0.001, False) for gap in range(1, 5)]
-    assert "stayed within 1.1 deg at the longest gap that was tried, 40 ms" in (
+    assert "stayed within 1.1 deg at the longest tried gap, 40 ms" in (
         gaps.longest_gap(kept, "position", 0.02, 0.004, 1.0).why
     )
 
@@ -102,7 +102,7 @@ def test_a_joint_that_does_not_follow_its_goal_has_no_dead_band():
 def test_a_longest_gap_is_one_that_left_the_path_or_in_which_the_joint_rested():
     kept = gaps.GapResult(0.01, 0.001, False)
     rested = gaps.longest_gap([kept, gaps.GapResult(0.02, 0.002, True)], "posvel", 0.02, 0.004, 1.0)
-    assert (rested.value, rested.limit) == (pytest.approx(0.015), "it comes to rest between commands")
+    assert (rested.value, rested.limit) == (pytest.approx(0.015), "the joint stops between commands")
     left = gaps.longest_gap([kept, gaps.GapResult(0.02, 0.021, False)], "position", 0.0191, 0.004, 1.0)
     assert left.value == pytest.approx(0.01905)
     assert left.value - left.uncertainty <= 0.01 + 1e-12, "all that lies between the gaps that were tried"
@@ -138,7 +138,7 @@ def test_the_search_goes_on_to_the_next_rate_that_controllers_allow(begin, step,
 
 
 def test_a_step_of_few_ticks_names_a_range_that_would_do():
-    assert "too small for positions in ticks of 0.088 deg; a range of about 2 deg would do" in (
+    assert "too small for positions in ticks of 0.088 deg; give a range of about 2 deg" in (
         response.response([step_of(0.01, 0.01)] * 8)[0].why
     )
 
@@ -155,7 +155,7 @@ def test_a_range_that_is_too_small_is_named_with_one_that_would_do(measures):
     done = measures(["speed"], "AX-12A", reach=0.2)
     top = done.figure(speeds.TOP)
     assert top.value is None
-    assert top.why.startswith("the range of 23 deg is too small to reach it: the joint came to ")
+    assert top.why.startswith("the range of 23 deg is too small: the joint reached ")
     assert done.figure(speeds.ACCELERATION).value is not None
 
 
@@ -166,7 +166,7 @@ def test_a_range_that_is_too_small_is_named_with_one_that_would_do(measures):
 @pytest.mark.parametrize("model", ["AX-12A", "MX-64"])
 def test_the_range_that_is_named_does(measures, model):
     why = measures(["speed"], model, reach=0.2).figure(speeds.TOP).why
-    needed = math.radians(float(why.rpartition("about ")[2].removesuffix(" deg would do")))
+    needed = math.radians(float(why.rpartition("about ")[2].removesuffix(" deg")))
     assert measures(["speed"], model, reach=needed / 2).figure(speeds.TOP).value is not None
 
 
@@ -181,7 +181,7 @@ def test_a_lost_servo_ends_it_and_what_was_measured_before_is_kept(measures):
     assert done.result.why == "joint joint (ID 1 on bus main) is lost"
     assert done.figure(speeds.TOP).value is not None
     band = done.figure(dead_band.NAME)
-    assert (band.value, band.why) == (None, f"the experiment ended before: {done.result.why}")
+    assert (band.value, band.why) == (None, f"the experiment ended early: {done.result.why}")
 
 
 def test_steps_before_an_early_end_give_a_response(measures):

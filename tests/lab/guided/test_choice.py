@@ -66,12 +66,11 @@ def test_a_range_is_taken_as_it_is_given(rig):
 def test_everything_that_is_wrong_with_ranges_is_refused_at_once(rig):
     assert refused(rig, "narrow", "wheel", "limp", narrow=(-30, 20)) == [
         "--range narrow=-30..20 deg is beyond the joint's limits of -20 to 90 deg; stay inside",
-        "joint wheel has no position limits, so its range must be given: --range wheel=-30deg..30deg",
+        "joint wheel has no position limits; give --range, such as wheel=-30deg..30deg",
     ]
     assert refused(rig, "narrow", "limp", narrow=(10, 60)) == [
-        "joint narrow is at 0 deg, outside of its --range; lead it inside first, or choose another",
-        "joint limp (ID 3 on bus main) is limp, so it cannot be moved; switch its torque on first: "
-        "dxlrun torque on limp",
+        "joint narrow is at 0 deg, outside of its --range; move the joint inside first",
+        "joint limp (ID 3 on bus main) is limp; enable its torque first: dxlrun torque on limp",
     ]
 
 
@@ -81,7 +80,7 @@ def test_everything_that_is_wrong_with_ranges_is_refused_at_once(rig):
         ("elbow", "--range elbow: write JOINT=LOWEST..HIGHEST, such as elbow=-30deg..30deg"),
         ("elbow=3deg", "--range elbow=3deg: write JOINT=LOWEST..HIGHEST, such as elbow=-30deg..30deg"),
         ("elbow=3..5deg", "--range elbow=3..5deg: '3' has no unit; write an angle with its unit"),
-        ("elbow=5deg..3deg", "--range elbow=5deg..3deg: the range must grow, by 2 deg at least"),
+        ("elbow=5deg..3deg", "--range elbow=5deg..3deg: set HIGHEST at least 2 deg above LOWEST"),
         ("elbow=nan deg..3deg", "--range elbow=nan deg..3deg: "),
     ],
 )
@@ -102,7 +101,7 @@ def test_wrong_names_are_refused(rig):
     assert caught.value.sentences == (
         "narow is not one of the robot's joints; did you mean narrow?",
         "joint limp is named twice; name it once",
-        "--range narrow: that joint takes no part in the experiment; name it too",
+        "--range narrow: joint narrow is not in the experiment; name the joint, too",
     )
     with pytest.raises(InputError, match="name the joints that may move: narrow, wheel, limp"):
         check_joints([], {}, joints)
@@ -113,5 +112,5 @@ def test_words_are_a_robot_file_its_arguments_and_joints():
         Path("a.yaml"), ("port:=sim",), ("x", "y")
     )
     assert RobotFileArguments.parse_words(["x", "y"]) == RobotFileArguments(None, (), ("x", "y"))
-    with pytest.raises(InputError, match="port:=sim is an argument of a robot file, and there is none"):
+    with pytest.raises(InputError, match="port:=sim is an argument of a robot file, but no file is given"):
         RobotFileArguments.parse_words(["x", "port:=sim"])

@@ -142,7 +142,7 @@ def test_a_run_that_ends_in_the_middle_ends_it(stage):
 
     done = perform_experiment(rig, stage.Plays(segments), situation_of(rig, ["elbow"], {}))
     assert done.why == "the run ended"
-    assert done.not_restored == ("the run of effort_arm ended, so nothing could be put back",)
+    assert done.not_restored == ("the run of effort_arm ended, so the run was not restored",)
     assert [part.outcome for part in done.recorded] == ["reached", "aborted"]
     assert len(done.recorded[1]) == pytest.approx(200, abs=15)
     with pytest.raises(RunGone):

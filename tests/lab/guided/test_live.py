@@ -128,7 +128,7 @@ def test_a_paused_robot_and_a_second_experiment_are_refused(rig, robot):
     finally:
         robot.resume()
     try:
-        with pytest.raises(InputError, match=r"another experiment works on pair \(experiment_pwm is"):
+        with pytest.raises(InputError, match=r"another experiment uses pair \(experiment_pwm is"):
             situation_of(rig, ["tilt"], {})
     finally:
         rig.unload_controller("experiment_pwm")
@@ -190,7 +190,7 @@ def test_a_key_is_an_abort_with_the_rest_kept(robot, stage, monkeypatch, capsys)
     said = capsys.readouterr().err
     assert "tilt (ID 7 on bus main) moves within -15 to 15 deg (--range); it is at" in said
     assert "any key ends it" in said
-    assert "pair: the experiment ended early: aborted by a key; 2 pieces measured before that" in said
+    assert "pair: the experiment ended early: aborted by a key; 2 segments measured before" in said
     assert termios.tcgetattr(theirs) == before
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
@@ -246,7 +246,7 @@ def test_a_part_without_a_result_is_one_more_sentence(place, stage, capsys):
     ran = run_on_robot(Asks(gives_up), ["pair.yaml", "pan"], ExperimentOptions(virtual=True))
     assert (ran.result, ran.exit_code) == (None, 1)
     assert capsys.readouterr().err.splitlines()[-2:] == [
-        "pair: the experiment ended early: no two responses are alike; 1 piece measured before that",
+        "pair: the experiment ended early: no two responses are alike; 1 segment measured before",
         "pair: too short",
     ]
     with pytest.raises(InputError, match="too short"):
@@ -379,4 +379,4 @@ def test_an_experiment_whose_gateway_dies_says_that_nothing_was_put_back(robot, 
     ran = run_on_robot(plays, ["tilt"])
     assert (ran.robot, ran.exit_code, len(plays.got)) == ("pair", 1, 1)
     assert "the run of pair" in ran.why
-    assert "so nothing could be put back" in capsys.readouterr().err
+    assert "so the run was not restored" in capsys.readouterr().err

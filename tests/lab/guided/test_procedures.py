@@ -59,7 +59,7 @@ def test_a_mode_that_a_servo_does_not_have_comes_back_to_the_procedure(stage):
     plays, done = stage.perform(
         stage.rig(stage.single), "joint", lambda joint: iter([Segment("v", 0.01, rows, interface="pwm")])
     )
-    assert plays.refused == ["joint joint (ID 1 on bus main) has no pwm mode, as an MX-64 has none"]
+    assert plays.refused == ["joint joint (ID 1 on bus main) has no pwm mode: MX-64 lacks the mode"]
     assert (done.why, done.recorded) == ("", ())
 
 

@@ -47,11 +47,11 @@ def to_and_fro(cycles: Any) -> Any:
         (set_to(position=lambda cycles: np.linspace(0.0, 0.5, len(cycles))), None, "hardly moved"),
         (set_to(position=to_and_fro, goal_position=to_and_fro), None, "one speed only"),
         (set_to(), 800, r"only \d\.\d s of this log"),
-        (set_to(goal_position=lambda cycles: -cycles["goal_position"][:, 0]), None, "no model of a servo"),
+        (set_to(goal_position=lambda cycles: -cycles["goal_position"][:, 0]), None, "no servo model"),
         pytest.param(
             set_to(goal_position=lambda cycles: np.roll(cycles["goal_position"][:, 0], len(cycles) // 3)),
             None,
-            "no model of a servo follows",
+            "no servo model fits",
             marks=CAMPAIGN,
         ),
     ],
@@ -94,7 +94,7 @@ def test_a_servo_that_is_lost_in_the_middle(xl330):
 def test_a_servo_with_an_integral_part(xl330):
     servo = xl330.servo
     declared = Servo(servo.joint, servo.table, servo.reference, servo.direction, {"position_i_gain": 100})
-    with pytest.raises(InputError, match="position_i_gain 100, and an integral part is not modelled"):
+    with pytest.raises(InputError, match="position_i_gain 100, but the model has no integral gain"):
         measured(xl330.cycles, 0, declared)
 
 

@@ -17,7 +17,7 @@ ROBOT = ROBOTS / "single_joint.yaml"
 OF_THE_PAGE = commands_of("experiments.md", "identify", "## Identify\n")
 
 
-@pytest.mark.parametrize(("number", "sentence"), [(1, "0.5 s are too short"), (2, "there is no log")])
+@pytest.mark.parametrize(("number", "sentence"), [(1, "0.5 s are too short"), (2, "not found; a run prints")])
 def test_the_other_commands_of_the_page(number, sentence, dxlrun, here):
     words = [word.replace("/dev/ttyUSB0", "sim") for word in OF_THE_PAGE[number]]
     said = dxlrun(*words, *(["--virtual", "--duration", "0.5"] if number == 1 else []))
@@ -31,7 +31,7 @@ def test_a_virtual_robot_is_moved_and_its_motor_file_written(dxlrun, here):
     said = dxlrun(*OF_THE_PAGE[0], "--duration", 10, "--report", report)
     assert said.code == 0, said.err
     assert "joint (MX-64)" in said.out
-    assert "* torques are from the manual's stall torque, 6 Nm at 12 V" in said.out
+    assert "* torques are scaled by the manual's stall torque, 6 Nm at 12 V" in said.out
     assert re.search(r"^ *inertia \*", said.out, re.MULTILINE)
     assert not re.search(r"^ *delay \*", said.out, re.MULTILINE)
     assert "slow triangles" in said.err
@@ -60,7 +60,7 @@ def test_a_log_as_json(xl330, dxlrun):
     ("words", "sentence"),
     [
         ((ROBOT, "joint", "--virtual", "--duration", "2"), "2 s are too short"),
-        ((ROBOT, "joint", "--virtual", "--range", "joint=-3deg..3deg"), "too small a range"),
+        ((ROBOT, "joint", "--virtual", "--range", "joint=-3deg..3deg"), "is too small to identify"),
     ],
 )
 def test_refusals(words, sentence, dxlrun, here):

@@ -38,5 +38,5 @@ def test_goals_stay_within_range_and_limits(  # noqa: PLR0917  of pytest
 def test_what_is_too_small():
     with pytest.raises(InputError, match=r"5 s are too short .* --duration 10"):
         excitation(Room(-1, 1), 5.0, 0.01, start=0.0)
-    with pytest.raises(InputError, match="too small a range"):
+    with pytest.raises(InputError, match="is too small to identify"):
         excitation(Room(-0.05, 0.05), 60.0, 0.01, start=0.0)

@@ -232,7 +232,7 @@ def test_without_the_right_to_real_time_one_sentence_says_so_beforehand(dxlrun, 
     said = run_short(dxlrun, runs)
     assert (said.code, said.out) == (2, "")
     assert said.err.startswith(
-        "dxlrun: real-time priority is needed for loop-realtime and sequential-realtime, and this user has no"
+        "dxlrun: this user may not use real-time priority, required by loop-realtime and sequential-realtime;"
     )
     assert realtime_grants.allow("rtprio", 32) in said.err
     assert f"--setups {NORMAL}" in said.err

@@ -195,7 +195,7 @@ motions:
 
 
 @pytest.mark.parametrize(
-    ("motion", "sentence"), [(TWO_PARTS, "has 2 parts"), (ONE_POINT, "has not two of them")]
+    ("motion", "sentence"), [(TWO_PARTS, "has 2 parts"), (ONE_POINT, "has fewer than two positions")]
 )
 def test_a_motion_that_cannot_be_compared_is_refused(tmp_path, motion, sentence):
     file = tmp_path / "motion.yaml"
