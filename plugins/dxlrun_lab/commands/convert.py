@@ -43,7 +43,7 @@ def convert(
         moved the joints in the log.
     """
     if motion.suffix not in (".yaml", ".yml"):
-        raise InputError(f"motion file {motion} does not end in .yaml; choose another name")
+        raise InputError(f"{motion} does not end in .yaml; give the name of a YAML file")
     tolerance = part.tolerance_rad
     from dxlrun_analysis.playback.motion_file import motion_file
     from dxlrun_analysis.playback.spline_path import tolerances

@@ -106,7 +106,7 @@ def _of_log(
     from dxlrun_lab.identify.identification import from_log
 
     if not log.exists():
-        raise InputError(f"log {log} not found; a run prints the path of its log at its end")
+        raise InputError(f"log {log} not found; a run prints the path of its log when it ends")
     if (
         options.virtual
         or options.robot

@@ -69,7 +69,7 @@ def replay(
         return play_recorded(log, chosen, played_on, part, as_json=as_json)
     _refuse_playing(played_on, part)
     if not log.exists():
-        raise InputError(f"log {log} not found; a run prints the path of its log at its end")
+        raise InputError(f"log {log} not found; a run prints the path of its log when it ends")
     arguments = parse_assignments(assignments)
     import msgspec
 

@@ -137,7 +137,7 @@ def _only(line: str, joint: str, *, speed: bool) -> str:
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["a.mcap"], "motion file a.mcap does not end in .yaml; choose another name"),
+        (["a.mcap"], "a.mcap does not end in .yaml; give the name of a YAML file"),
         (["none/a.yaml"], "there is no directory none"),
         (["a.yaml", "--joint", "pan"], "a motion file needs all joints of both; convert tilt too"),
         (
