@@ -44,6 +44,4 @@ def test_the_runs_are_shown_in_a_table_and_the_rate_in_a_sentence(
     assert head.split()[:4] == ["rate", "cycles", "overruns", "by"]
     assert row.split()[0] in running
     assert row.split()[-1] == "yes"
-    assert verdict.startswith(
-        f"single_joint keeps {row.split()[0]} Hz on this machine; the buses allow"
-    )
+    assert verdict.startswith(f"single_joint keeps {row.split()[0]} Hz on this machine; the buses allow")

@@ -68,7 +68,7 @@ def test_stress_ng_takes_the_place_of_both_where_it_is_installed(tmp_path):
     program.chmod(0o755)
     cores = len(os.sched_getaffinity(0))
     with Stress() as load:
-        assert load.text.startswith(f"stress-ng, {cores} busy process")
+        assert load.text.startswith(f"stress-ng: {cores} busy process")
         words = tmp_path / "words"
         until(lambda: words.is_file() and words.read_text().endswith("\n"))
         assert words.read_text().split() == [

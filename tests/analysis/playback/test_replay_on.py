@@ -138,7 +138,7 @@ def test_a_speed_that_is_slow_enough_is_named(swing: Path, place: Path, dxlrun: 
         (["--tolerance", "x"], "--tolerance x"),
         (["--tolerance", "20deg"], "--tolerance 20deg: give an angle above 0 and up to 10 deg"),
         (["--topic", "/x"], "--topic /x: "),
-        (["--set", "both.speed=1"], "--set is for the controllers of the log"),
+        (["--set", "both.speed=1"], "--set and --on exclude each other"),
     ],
 )
 def test_wrong_words_are_refused(

@@ -286,7 +286,7 @@ def test_the_dead_band_is_margin_and_friction_over_the_gain(measures, model, fri
         margin = math.degrees(registers.get("cw_compliance_margin", 1) * tick)
         assert band.limit.startswith(f"{margin:.2f} deg by the compliance margin")
     else:
-        assert "the model has no margin" in band.limit
+        assert "the model has no compliance margin" in band.limit
 
 
 # Gaps

@@ -153,7 +153,7 @@ def logging_to(log: Path | None) -> Any:
 @pytest.mark.needs("identify")
 def test_a_robot_without_its_whole_log_is_refused(tmp_path, monkeypatch, capsys):
     """One that records none; one that deletes parts and runs, and one that would have to be started."""
-    with pytest.raises(InputError, match="pair records no log, but an experiment needs it"):
+    with pytest.raises(InputError, match="pair records no log, but an experiment needs a log"):
         live_rig(logging_to(None))
     file = tmp_path / "robot.yaml"
     file.write_text(ROBOT + "recording: {split: 1 min, keep: 10 min}\n")
@@ -189,7 +189,7 @@ def test_a_key_is_an_abort_with_the_rest_kept(robot, stage, monkeypatch, capsys)
     assert (ran.why, ran.result, ran.exit_code) == ("aborted by a key", 2, 130)
     said = capsys.readouterr().err
     assert "tilt (ID 7 on bus main) moves within -15 to 15 deg (--range); it is at" in said
-    assert "any key ends it" in said
+    assert "any key ends the experiment" in said
     assert "pair: the experiment ended early: aborted by a key; 2 segments measured before" in said
     assert termios.tcgetattr(theirs) == before
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
@@ -286,7 +286,7 @@ def test_without_a_yes_no_run_is_started(place, stage, monkeypatch, capsys, answ
             threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()
         words, options = ["pair.yaml", "tilt"], ExperimentOptions(range=("tilt=-15deg..15deg",))
         if answer is None:
-            with pytest.raises(InputError, match="without a terminal nobody can confirm that they may move"):
+            with pytest.raises(InputError, match="their motion cannot be confirmed without a terminal"):
                 run_on_robot(plays, words, options)
         else:
             ran = run_on_robot(plays, words, options)

@@ -42,7 +42,7 @@ def to_and_fro(cycles: Any) -> Any:
     [
         (set_to(torque=Torque.RELEASED), None, "never under torque with a goal"),
         (set_to(mode=Mode.VELOCITY), None, "never under torque with a goal"),
-        (set_to(voltage=np.nan), None, "no voltage"),
+        (set_to(voltage=np.nan), None, "no supply voltage"),
         (set_to(position=0.1), None, "never moved"),
         (set_to(position=lambda cycles: np.linspace(0.0, 0.5, len(cycles))), None, "hardly moved"),
         (set_to(position=to_and_fro, goal_position=to_and_fro), None, "one speed only"),
@@ -105,9 +105,9 @@ def test_an_ax_12_without_a_current_has_the_manuals_scale(record):
     data = measured(run.cycles, 0, run.servo)
     found = identified(data, fit_run(data), KnownLoad(), "test")
     assert found.scale == "manual"
-    assert "no interval contains its error" in found.scale_sentence
+    assert "the intervals exclude its error" in found.scale_sentence
     assert "viscous_friction" not in {value.name for value in found.values}
-    assert any("viscous friction and back-EMF are one" in note for note in found.notes)
+    assert any("viscous friction and back-EMF cannot be separated" in note for note in found.notes)
     figures = {value.name: value for value in found.values}
     assert "torque_constant" not in figures
     constant = figures["torque_constant_with_viscous_friction"]

@@ -72,5 +72,5 @@ def test_refusals(words, sentence, dxlrun, here):
 def test_a_log_takes_joints_only(xl330, dxlrun):
     said = dxlrun("identify", ROBOT, "elbow", "--recorded", xl330.log.path)
     assert said.code == 2
-    assert "--recorded evaluates an earlier run" in said.err
+    assert "--recorded evaluates a log" in said.err
     assert "no joint elbw" in dxlrun("identify", "elbw", "--recorded", xl330.log.path).err
