@@ -11,8 +11,6 @@ import gc
 import os
 import re
 import signal
-import subprocess
-import zlib
 from collections.abc import Callable, Generator, Iterator
 from contextlib import suppress
 from importlib.util import find_spec
@@ -21,112 +19,12 @@ from typing import NamedTuple, TypeVar
 
 import pytest
 from hypothesis import settings
-from tests.kit import campaigns
+from tests.kit import campaigns, selection
 
 settings.register_profile("fixed", derandomize=True, print_blob=True)
 settings.register_profile("search", derandomize=False, print_blob=True, max_examples=2000)
 settings.load_profile("fixed")
 gc.set_threshold(50_000, 20, 20)  # as in `dxlrun`: the many tests that are collected are no garbage
-
-
-SAMPLED = (
-    "analysis/playback/test_convert.py",
-    "analysis/playback/test_replay_on.py",
-    "analysis/replay/test_chains.py",
-    "analysis/replay/test_command_line.py",
-    "analysis/replay/test_same.py",
-    "analysis/replay/test_steered.py",
-    "analysis/report/test_page.py",
-    "analysis/report/test_plots.py",
-    "analysis/season/test_logs.py",
-    "analysis/season/test_store.py",
-    "analysis/test_traffic.py",
-    "bench/test_cycle_trace.py",
-    "bench/test_exchange.py",
-    "bench/test_exchange_command.py",
-    "cli/test_bench.py",
-    "cli/test_device_tools.py",
-    "cli/test_eighty_columns.py",
-    "cli/test_examples.py",
-    "cli/test_latency.py",
-    "cli/test_narrow.py",
-    "cli/test_other_systems.py",
-    "cli/test_pictures.py",
-    "cli/test_recipes.py",
-    "cli/test_servo.py",
-    "cli/test_sim.py",
-    "cli/test_streams.py",
-    "cli/test_tutorial.py",
-    "control/test_long_runs.py",
-    "dynamixel/test_plugin_models.py",
-    "hand/test_terminal.py",
-    "lab/characterize/test_command.py",
-    "lab/characterize/test_known_servos.py",
-    "lab/characterize/test_wrong_data.py",
-    "lab/guided/test_live.py",
-    "lab/guided/test_procedures.py",
-    "lab/identify/test_broken_runs.py",
-    "lab/identify/test_command.py",
-    "lab/identify/test_published.py",
-    "lab/identify/test_recovery.py",
-    "lab/tracking/test_command.py",
-    "lab/tracking/test_measurement.py",
-    "log/test_readers.py",
-    "mechanics/test_coupled_runs.py",
-    "phidget/tests/test_spatial.py",
-    "plugins/controllers/test_ilc_controller.py",
-    "plugins/test_docs.py",
-    "plugins/test_example.py",
-    "robots/test_arms.py",
-    "robots/test_feed_forward.py",
-    "robots/test_learning.py",
-    "robots/test_mechanics.py",
-    "robots/test_orientation.py",
-    "robots/test_stand_up.py",
-    "robots/test_steered_chains.py",
-    "robots/test_steered_examples.py",
-    "robots/test_thesis_motions.py",
-    "run/test_every_model.py",
-    "run/test_new_log.py",
-    "simulation/test_recorded_bus.py",
-    "teleop/test_drive.py",
-    "view/test_command.py",
-)
-"""Runs through all processes, commands of pages, and experiments: some seconds each; CI runs a sample.
-
-No test of how a run ends is among them, nor of what the network is refused: those of safety always run.
-"""
-SHARE = int(os.environ.get("DXLRUN_LONG", "9"))
-
-
-def commit() -> str:
-    """Return the commit of this tree, so that each one draws another sample; empty outside a clone."""
-    asked = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short=12", "HEAD"]
-    try:
-        return subprocess.run(asked, capture_output=True, text=True, check=False).stdout.strip()
-    except OSError:  # git is not installed
-        return ""
-
-
-SEED = os.environ.get("DXLRUN_LONG_SEED") or commit()
-
-
-def pytest_report_header() -> str:
-    """Tell how to repeat the sample."""
-    return f"long tests: one in {SHARE} (DXLRUN_LONG={SHARE}), drawn by DXLRUN_LONG_SEED={SEED}"
-
-
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out long tests that are not in the sample: one in `DXLRUN_LONG` is, 1 runs them all."""
-
-    def sampled(item: pytest.Item) -> bool:
-        long = item.path.as_posix().endswith(SAMPLED)
-        return not long or zlib.crc32(f"{SEED} {item.nodeid}".encode()) % SHARE == 0
-
-    left_out = [item for item in items if not sampled(item)]
-    if left_out and len({item.path for item in items}) > 1:  # a file that is named is run as a whole
-        config.hook.pytest_deselected(items=left_out)
-        items[:] = [item for item in items if sampled(item)]
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
@@ -239,11 +137,13 @@ class Extras:
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     campaigns.add_options(parser)
+    selection.add_options(parser)
 
 
 def pytest_configure(config: pytest.Config) -> None:
     config.pluginmanager.register(Extras())
     config.pluginmanager.register(campaigns.Campaigns(config))
+    config.pluginmanager.register(selection.Selection(config))
     # a shell ignores Ctrl-C for what it starts in the background, and what that starts inherits it
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -22,24 +22,24 @@ ROOT = Path(__file__).parents[1]
 SHIPPED = ("docs", "plugins", "release", "robots", "runtime", "tests")
 
 
-def run(*words: str, directory: Path = ROOT, seed: str = "") -> subprocess.CompletedProcess[str]:
-    """Run this interpreter without the options of the tests' own run; no seed: no sample, all long tests."""
+def run(*words: str, directory: Path = ROOT) -> subprocess.CompletedProcess[str]:
+    """Run this interpreter without the options of the tests' own run."""
     environment = {key: value for key, value in os.environ.items() if not key.startswith(("PYTEST", "COV_"))}
-    environment |= {"DXLRUN_LONG_SEED": seed, "DXLRUN_LONG": "4" if seed else "1", "PYTHONPATH": str(ROOT)}
+    environment |= {"PYTHONPATH": str(ROOT)}
     return subprocess.run(
         [sys.executable, *words], cwd=directory, env=environment, capture_output=True, text=True, check=False
     )
 
 
 def pytest_on(
-    source: str, directory: Path, *options: str, seed: str = "", conftest: str = ""
+    source: str, directory: Path, *options: str, conftest: str = ""
 ) -> subprocess.CompletedProcess[str]:
     """Run pytest on one test file, with the settings of this suite."""
     path = directory / "test_made_up.py"
     path.write_text(source)
     config = ("-c", str(ROOT / "pyproject.toml"), f"--rootdir={directory}", "-p", "no:cacheprovider")
     (directory / "conftest.py").write_text(conftest or (ROOT / "tests/conftest.py").read_text())
-    return run("-m", "pytest", "-q", *config, *options, str(path), directory=directory, seed=seed)
+    return run("-m", "pytest", "-q", *config, *options, str(path), directory=directory)
 
 
 def test_every_test_has_a_limit(pytestconfig: pytest.Config) -> None:
@@ -197,7 +197,7 @@ def test_the_campaigns_are_those_of_the_table() -> None:
     texts = {str(path.relative_to(ROOT)): path.read_text() for path in ROOT.glob("tests/*/**/test_*.py")}
     marked = {path for path, text in texts.items() if re.search(r"pytest\.mark\.campaign\b(?!\()", text)}
     assert {path for path in marked - named if str(Path(path).parent) not in beside} == set()
-    assert named - marked == {"tests/conftest.py"}
+    assert named - marked == set()
 
 
 def test_each_fragment_of_the_changelog_is_one_that_towncrier_takes() -> None:

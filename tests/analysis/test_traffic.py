@@ -20,6 +20,8 @@ from dxlsim.faults.fault import parse_fault
 from dxlsim.faults.script import FaultScript
 from dxlwire.packets import PacketKind
 
+pytestmark = pytest.mark.long
+
 ROBOTS = Path(__file__).parents[2] / "robots"
 VARIOUS = ("bioloid_torso", "humanoid_20", "mechanics", "wolfgang")
 """Robots of both protocols, of one bus and of four, with devices, and with several servos a joint."""

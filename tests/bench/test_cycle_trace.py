@@ -1,6 +1,10 @@
 """The number of functions and files that a cycle of the loop goes through is bounded."""
 
+import pytest
+
 import cycle_trace
+
+pytestmark = pytest.mark.long
 
 MOST_FUNCTIONS = 27
 MOST_FILES = 17

@@ -27,6 +27,8 @@ from exchange.responder import Terminal
 from exchange.rounds import Measured, measure
 from exchange.wire import judge
 
+pytestmark = pytest.mark.long
+
 SECONDS = 0.2
 TIMEOUT_S = 60.0
 """How long a test waits for what must come; it decides nothing but when to give up."""

@@ -12,6 +12,8 @@ import pytest
 from exchange import hosts
 from exchange.command import main
 
+pytestmark = pytest.mark.long
+
 FEW = ("--servos", "1", "--protocol", "2.0", "--seconds", "0.05")
 FOLDER = Path(__file__).parent / "exchange"
 

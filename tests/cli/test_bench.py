@@ -14,6 +14,8 @@ from dxlrun.run.run_summary import RunSummary
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun_lab import highest_rate
 
+pytestmark = pytest.mark.long
+
 ROBOT = Path(__file__).parents[2] / "robots" / "single_joint.yaml"
 
 

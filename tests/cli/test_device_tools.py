@@ -6,6 +6,7 @@ import re
 import shlex
 from pathlib import Path
 
+import pytest
 from tests.kit.answers import result_of
 from tests.kit.pages import page_text
 
@@ -14,6 +15,8 @@ from dxlrun.testing import simulated_robot
 from dxlsim.faults.fault import parse_fault
 from dxlsim.faults.script import FaultScript
 from dxlsim.simulation_plan import BusConfig, DeviceConfig, ServoConfig
+
+pytestmark = pytest.mark.long
 
 NEW = ("--protocol", "2.0", "--baud", "1000000")
 OLD = ("--protocol", "1.0", "--baud", "1000000")

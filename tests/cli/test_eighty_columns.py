@@ -20,6 +20,8 @@ from dxlrun.remote.preparation import Preparation
 from dxlrun.run import run_summary
 from dxlrun.testing import plan_of, simulated_robot
 
+pytestmark = pytest.mark.long
+
 ROBOTS = sorted((Path(__file__).parents[2] / "robots").glob("*.yaml"))
 
 

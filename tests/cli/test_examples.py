@@ -14,6 +14,8 @@ from dxlrun.cli import inputs
 from dxlrun.compile.robot_compiler import compile_files
 from dxlrun.errors import DxlrunError
 
+pytestmark = pytest.mark.long
+
 ROBOTS = Path(__file__).parents[2] / "robots"
 NAMES = sorted(path.stem for path in ROBOTS.glob("*.yaml"))
 

@@ -30,6 +30,8 @@ from dxlrun_analysis.latency.statistics import Block
 from dxlrun_lab import stress
 from dxlrun_lab.latency import latency_measurement
 
+pytestmark = pytest.mark.long
+
 Dxlrun = Callable[..., Any]
 needs_cc = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
 COMMAND = "import sys; from dxlrun.cli import main; sys.exit(main())"

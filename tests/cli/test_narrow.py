@@ -12,6 +12,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.long
+
 CODE = "import sys; from dxlrun.cli import main; sys.exit(main(sys.argv[1:]))"
 
 

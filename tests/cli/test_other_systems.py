@@ -15,6 +15,8 @@ from typing import NamedTuple
 
 import pytest
 
+pytestmark = pytest.mark.long
+
 ROOT = Path(__file__).parents[2]
 DXLRUN = str(Path(sys.executable).with_name("dxlrun"))
 TORSO = str(ROOT / "robots/bioloid_torso.yaml")

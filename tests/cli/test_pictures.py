@@ -25,7 +25,7 @@ OTHERS = ("terminal", "scan", "fall", "cycle", "setup_hands", "calibrate_hands",
 """Pictures that need neither Chromium nor minutes, and that the machine changes."""
 
 
-pytestmark = pytest.mark.timeout(300)
+pytestmark = [pytest.mark.long, pytest.mark.timeout(300)]
 
 
 def words(path: Path) -> list[str]:

@@ -29,6 +29,8 @@ from dxlrun.tooling.runs import VirtualLink
 from dxlsim.faults.fault import parse_fault
 from dxlsim.faults.script import FaultScript
 
+pytestmark = pytest.mark.long
+
 ROOT = Path(__file__).parents[2]
 PAGE = page_text("recipes.md")
 PROGRAMS = dict(

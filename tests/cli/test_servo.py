@@ -17,6 +17,8 @@ from dxlrun.log.log_reader import read_log
 from dxlsim.simulation_plan import BusConfig, ServoConfig
 from dxlwire.packets import PacketKind
 
+pytestmark = pytest.mark.long
+
 NEW = ("--protocol", "2.0", "--baud", "1000000")
 OLD = ("--protocol", "1.0", "--baud", "1000000")
 

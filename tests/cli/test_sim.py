@@ -25,6 +25,8 @@ from tests.kit.pages import page_text
 
 from dxlsim.bus.ledger import read_ledger
 
+pytestmark = pytest.mark.long
+
 CODE = "import sys; from dxlrun.cli import main; sys.exit(main(sys.argv[1:]))"
 OWN_TERMINAL = "import fcntl, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0)"
 """As a shell does it, so that Ctrl-C is a signal."""

@@ -40,7 +40,7 @@ INSTALLS = (
 )
 STARTS = 3
 """Of a robot: where the machine is busy, its servos may answer too late."""
-pytestmark = pytest.mark.timeout(300)
+pytestmark = [pytest.mark.long, pytest.mark.timeout(300)]
 """Robots of whole pages, one after the other, in real time."""
 
 

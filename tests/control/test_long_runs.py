@@ -19,6 +19,8 @@ from dxlrun_controllers.motions.joint_trajectory_controller import (
     TrajectoryParameters,
 )
 
+pytestmark = pytest.mark.long
+
 RATES = (25.0, 50.0, 100.0, 200.0)
 OWN_NS = {"half": 80_000_000, "tenth": 200_000_000}
 """Periods of controllers with rates of their own: 12.5 and 5 Hz divide all of RATES."""

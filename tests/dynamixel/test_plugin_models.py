@@ -18,6 +18,8 @@ from dxlrun.control.controllers.plugin_loading import load_plugins
 from dxlrun.log.log_reader import read_log
 from dxlwire.control_table import added_control_tables, find_table
 
+pytestmark = pytest.mark.long
+
 TABLES = Path(dxlwire.control_table.__file__).parent / "tables"
 PLUGIN = """
 from pathlib import Path

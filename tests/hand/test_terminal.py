@@ -12,6 +12,8 @@ from tests.kit.pages import page_text
 
 from dxlrun.description.motion import read_motion
 
+pytestmark = pytest.mark.long
+
 PAGE = page_text("by-hand.md")
 COMMANDS = re.findall(r"^    dxlrun (.+)$", PAGE, re.MULTILINE)
 ROBOT = """\

@@ -24,6 +24,8 @@ from dxlrun.log.log_reader import open_log
 from dxlrun.plan.recording_plan import RecordingPlan
 from dxlrun.testing import VirtualRobot, plan_of
 
+pytestmark = pytest.mark.long
+
 ROBOTS = Path(__file__).parents[2] / "robots"
 PYMCAP = """
 import sys

@@ -27,6 +27,8 @@ from dxlrun_controllers.group import (
     JointGroupVelocityController,
 )
 
+pytestmark = pytest.mark.long
+
 TURN = 4096
 
 

@@ -32,7 +32,7 @@ controllers:
   wave: {type: ./wave.py:Wave, joints: [pan], amplitude: 20 deg}
 """
 Shell = Callable[..., Any]
-pytestmark = pytest.mark.timeout(400)
+pytestmark = [pytest.mark.long, pytest.mark.timeout(400)]
 """Some build and install packages, with what they depend on from an index."""
 
 

@@ -21,7 +21,7 @@ SAYS = {
     "dxlrun example.yaml --virtual --duration 1": "0 of 50 periods skipped",
 }
 Shell = Callable[..., Any]
-pytestmark = pytest.mark.timeout(400)
+pytestmark = [pytest.mark.long, pytest.mark.timeout(400)]
 """The first of them builds and installs packages, with what they depend on from an index."""
 
 

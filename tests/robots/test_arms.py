@@ -12,6 +12,8 @@ from tests.kit.clients import Ask, steered
 
 from dxlrun.channels.event_records import EventCode
 
+pytestmark = pytest.mark.long
+
 ARM = """
 name: chained_arm
 buses:

@@ -21,6 +21,8 @@ from dxlrun.description.joints.motor_file import motor_text
 from dxlrun.testing import read_log, simulated_robot
 from dxlrun_analysis.replay import replay_log
 
+pytestmark = pytest.mark.long
+
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "robots/single_joint_feed_forward.yaml"
 SECONDS = 4.0

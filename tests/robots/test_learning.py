@@ -20,6 +20,8 @@ from dxlrun.compile.motions import LEAD_NS
 from dxlrun.testing import Log, read_log, simulated_robot
 from dxlrun_analysis.replay import Setting, replay_log
 
+pytestmark = pytest.mark.long
+
 ROBOTS = Path(__file__).parents[2] / "robots"
 ROBOT = ROBOTS / "single_joint_learning.yaml"
 MOTION = ROBOTS / "motions/single_joint_learning.yaml"

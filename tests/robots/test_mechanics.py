@@ -25,6 +25,8 @@ from dxlrun_analysis.replay import replay_log
 from dxlsim.faults.fault import parse_fault
 from dxlsim.faults.script import FaultScript
 
+pytestmark = pytest.mark.long
+
 ROBOTS = Path(__file__).parents[2] / "robots"
 ROBOT, MOTION = ROBOTS / "mechanics.yaml", ROBOTS / "motions" / "mechanics_reach.yaml"
 

@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 from dxlrun.log.log_reader import Log, read_log
 from dxlrun.testing import simulated_robot
 
+pytestmark = pytest.mark.long
+
 Array = NDArray[np.float64]
 DRIFT_S = float(os.environ.get("DXLRUN_DRIFT_S", "8"))
 LINK = """<inertial>

@@ -22,6 +22,8 @@ from dxlrun.tooling.runs import VirtualLink
 from dxlsim.faults.fault import parse_fault
 from dxlsim.faults.script import FaultScript
 
+pytestmark = pytest.mark.long
+
 ROOT = Path(__file__).parents[2]
 PLAN = plan_of(ROOT / "robots" / "stand_up.yaml")
 PUSHES = re.findall(r"^    dxlrun send (.+)$", page_text("recipes.md"), re.MULTILINE)

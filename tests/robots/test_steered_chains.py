@@ -12,6 +12,8 @@ from tests.kit.clients import Ask, steered
 
 from dxlrun.channels.event_records import EventCode
 
+pytestmark = pytest.mark.long
+
 ROBOTS = Path(__file__).parents[2] / "robots"
 MS = 1_000_000
 

@@ -12,6 +12,8 @@ from tests.kit.clients import command_of, played
 from dxlsim.motion.motor import motor_of
 from dxlwire.control_table import find_table
 
+pytestmark = pytest.mark.long
+
 MOTIONS = Path(__file__).parents[2] / "robots" / "motions"
 STEP_S = 3.0
 REST = 3

@@ -7,6 +7,8 @@ import pytest
 from dxlrun.testing import simulated_robot
 from dxlwire.control_table import find_table, model_names
 
+pytestmark = pytest.mark.long
+
 ROBOT = """\
 name: one
 buses:

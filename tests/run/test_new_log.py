@@ -16,6 +16,8 @@ from dxlrun.log.log_writer import LogFile
 from dxlrun.plan.recording_plan import RecordingPlan
 from dxlrun.run.run_log import discard_log, new_log
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture
 def one_second(monkeypatch):

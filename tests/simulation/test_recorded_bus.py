@@ -30,6 +30,8 @@ from dxlsim.simulation_plan import BusConfig, SimulationConfig
 from dxlwire.packets import PacketKind
 from exchange.simulated import SimulatedServos
 
+pytestmark = pytest.mark.long
+
 ROBOT = """\
 name: pair
 arguments:

@@ -16,6 +16,8 @@ from dxlrun_teleop.bank import banks_of
 from dxlrun_teleop.drive import Drive
 from dxlrun_teleop.source import InputState
 
+pytestmark = pytest.mark.long
+
 ROBOTS = Path(__file__).parents[2] / "robots"
 BEGIN_S, END_S, HELD_S = 1.0, 2.0, 0.25
 VELOCITY, POSITION = (104, 4), (116, 4)

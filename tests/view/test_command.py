@@ -19,6 +19,8 @@ import pytest
 from tests.kit.awaited import DEADLINE_S
 from tests.kit.pages import page_text
 
+pytestmark = pytest.mark.long
+
 ROOT = Path(__file__).resolve().parents[2]
 COMMANDS = re.findall(r"^    dxlrun (view.*)$", page_text("view.md"), re.MULTILINE)
 CODE = "import sys; from dxlrun.cli import main; sys.exit(main())"

@@ -16,6 +16,8 @@ from dxlrun import SensorContext
 from dxlrun_phidget import PhidgetSpatial, PhidgetSpatialParameters
 from dxlrun_phidget.plugin import dxlrun_sensors
 
+pytestmark = pytest.mark.long
+
 TIMEOUT = 0x03
 """EPHIDGET_TIMEOUT of phidget22.h"""
 

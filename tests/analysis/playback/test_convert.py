@@ -19,6 +19,8 @@ from dxlrun.plan.loop_plan import ControllerPlan
 from dxlrun_analysis.playback.motion_file import motion_file
 from dxlrun_analysis.playback.recorded_motion import RecordedMotion
 
+pytestmark = pytest.mark.long
+
 Dxlrun = Callable[..., Any]
 
 

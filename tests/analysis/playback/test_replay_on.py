@@ -27,6 +27,8 @@ from dxlrun_analysis.playback.sources import read_motion
 from dxlrun_lab.commands import on_robot
 from dxlrun_lab.guided import virtual_rig
 
+pytestmark = pytest.mark.long
+
 Dxlrun = Callable[..., Any]
 
 

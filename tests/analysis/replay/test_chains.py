@@ -28,6 +28,8 @@ from dxlrun.log.log_reader import read_log
 from dxlrun.testing import VirtualRobot
 from dxlrun_analysis.replay import Setting, replay_log
 
+pytestmark = pytest.mark.long
+
 ROBOT = """\
 name: chained
 buses:

@@ -13,6 +13,8 @@ from tests.kit.pages import page_text
 
 from dxlrun.cli import main
 
+pytestmark = pytest.mark.long
+
 ROOT = Path(__file__).parents[3]
 TEXT = page_text("replay.md")
 COMMANDS = [line.strip() for line in TEXT.splitlines() if line.startswith("    dxlrun ")]

@@ -22,6 +22,8 @@ from dxlrun.testing import plan_of, simulated_robot
 from dxlrun_analysis.replay import replay_log
 from dxlrun_analysis.replay.recorded_inputs import recorded
 
+pytestmark = pytest.mark.long
+
 ROBOTS = Path(__file__).parents[3] / "robots"
 DXLRUN = Path(sys.executable).with_name("dxlrun")
 

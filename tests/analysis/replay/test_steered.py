@@ -30,6 +30,8 @@ from dxlrun.testing import VirtualRobot
 from dxlrun_analysis.conduct.client_commands import client_commands, policy_begun
 from dxlrun_analysis.replay import replay_log
 
+pytestmark = pytest.mark.long
+
 Changed = Callable[..., Path]
 MS = 1_000_000
 MORE = """\

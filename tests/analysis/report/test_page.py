@@ -24,6 +24,8 @@ from dxlrun_analysis.page.report_page import analyzed_page
 from dxlrun_analysis.report import analyze, tables
 from dxlwire.packets import PacketKind
 
+pytestmark = pytest.mark.long
+
 Make = Callable[..., Any]
 _VOID = {"meta", "br", "img", "input", "link", "hr"}
 

@@ -25,6 +25,8 @@ from dxlrun_analysis.page.run_curves import CurveCollector, CurvesOfRun, joint_c
 from dxlrun_analysis.report import analyze
 from dxlwire.packets import PacketKind
 
+pytestmark = pytest.mark.long
+
 Make = Callable[..., Any]
 Data = NDArray[np.float64]
 COUNT, LONG = 40, 9000

@@ -32,6 +32,8 @@ from dxlrun_analysis.report import analyze_log
 from dxlrun_analysis.season import season_runs
 from dxlrun_analysis.season.pools import processes
 
+pytestmark = pytest.mark.long
+
 ROBOTS = Path(__file__).parents[3] / "robots"
 NAMES = ["first.mcap", "may/broken.mcap", "may/copy.mcap", "may/second.mcap", "may/third.mcap"]
 Here = list[str]  # Names of the logs that were read

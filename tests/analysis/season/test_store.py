@@ -20,6 +20,8 @@ from dxlrun.testing import VirtualRobot, plan_of, simulated_robot
 from dxlrun_analysis.season import season_runs
 from dxlrun_analysis.season import store as stores
 
+pytestmark = pytest.mark.long
+
 JOINT = Path(__file__).parents[3] / "robots" / "single_joint.yaml"
 NAMES = ["may/second.mcap", "one.mcap", "parts"]
 

@@ -14,7 +14,7 @@ from dxlrun_lab.characterize import procedure
 FIGURES = {name for figures in procedure._FIGURES.values() for name, _ in figures}
 
 
-pytestmark = pytest.mark.usefixtures("here")
+pytestmark = [pytest.mark.long, pytest.mark.usefixtures("here")]
 
 
 def slow_bus(tmp_path: Path) -> Path:

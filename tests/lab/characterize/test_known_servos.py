@@ -24,6 +24,8 @@ from dxlsim.motion.motor import motor_of
 from dxlsim.servo.simulated_servo import SimulatedServo
 from dxlsim.simulation_plan import BusConfig, Load, ServoConfig, ServoTimes
 
+pytestmark = pytest.mark.long
+
 FIVE_PERCENT = 0.05
 MS = 1_000_000
 PROTOCOLS = {"AX-12A": 1.0, "MX-64": 1.0, "XL430-W250": 2.0, "XM430-W350": 2.0}

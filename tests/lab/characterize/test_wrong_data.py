@@ -15,6 +15,8 @@ from dxlrun_lab.characterize import characterization_tables, dead_band, gaps, ra
 from dxlrun_lab.characterize.joint_figure import JointFigure
 from dxlrun_lab.characterize.trace import Trace
 
+pytestmark = pytest.mark.long
+
 TICK = math.radians(0.088)
 Measures = Callable[..., Any]
 

@@ -35,6 +35,8 @@ from dxlrun_lab.guided.own_run import OwnRun
 from dxlrun_lab.guided.rig import live_rig
 from dxlrun_lab.guided.segment import Segment
 
+pytestmark = pytest.mark.long
+
 INTERRUPTS = int(os.environ.get("DXLRUN_EXPERIMENT_INTERRUPTS", "0"))
 CODE = "import sys; from dxlrun.cli import main; sys.exit(main())"
 ROBOT = """\

@@ -8,6 +8,8 @@ import pytest
 from dxlrun.log.log_reader import read_log
 from dxlrun_lab.guided.segment import Guard, Segment
 
+pytestmark = pytest.mark.long
+
 
 def test_a_segment_is_recorded_cycle_by_cycle_from_its_first_row_to_its_end(stage):
     rig = stage.rig(stage.single)

@@ -17,6 +17,8 @@ from dxlrun_lab.identify.known_servo import Servo, servos_in
 from dxlrun_lab.identify.result import KnownLoad, identified
 from dxlwire.modes import Mode
 
+pytestmark = pytest.mark.long
+
 LOAD = KnownLoad(0.005, 0.3)
 RUNS = int(os.environ.get("DXLRUN_IDENTIFY_RUNS", "0"))
 CAMPAIGN = (

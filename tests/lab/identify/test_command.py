@@ -12,6 +12,8 @@ from tests.kit.experiments import ROBOTS, commands_of
 
 from dxlrun.description.joints.motor_file import read_motor
 
+pytestmark = pytest.mark.long
+
 RUNS = int(os.environ.get("DXLRUN_IDENTIFY_RUNS", "0"))
 ROBOT = ROBOTS / "single_joint.yaml"
 OF_THE_PAGE = commands_of("experiments.md", "identify", "## Identify\n")

@@ -31,6 +31,8 @@ from dxlrun_lab.identify.result import IdentifiedServo, KnownLoad, identified
 from dxlwire.control_table import find_table
 from dxlwire.modes import Mode
 
+pytestmark = pytest.mark.long
+
 RECORDINGS = os.environ.get("DXLRUN_BAM_RECORDINGS", "0")
 TICK = math.tau / 4096
 MASS, LENGTH, G = 0.49, 0.1, 9.80665

@@ -21,6 +21,8 @@ from dxlrun_lab.identify.joint_recording import measured
 from dxlrun_lab.identify.result import IdentifiedServo, KnownLoad, identified
 from dxlsim.motion.motor import Motor
 
+pytestmark = pytest.mark.long
+
 GRAVITY, INERTIA = 0.3, 0.005
 RUNS = int(os.environ.get("DXLRUN_IDENTIFY_RUNS", "0"))
 LOAD = KnownLoad(INERTIA, GRAVITY)

@@ -27,6 +27,8 @@ from dxlrun_lab.tracking.setups import SETUPS, Setup
 from dxlrun_lab.tracking.tracking_experiment import TrackingExperiment
 from dxlrun_lab.tracking.tracking_report import page, table
 
+pytestmark = pytest.mark.long
+
 Make = Callable[..., Any]
 NORMAL = "sequential-normal,loop-normal"
 

@@ -17,6 +17,8 @@ from dxlrun_lab.tracking import motion_evaluation
 from dxlrun_lab.tracking.desired_motion import desired_motion
 from dxlrun_lab.tracking.motion_evaluation import measure_tracking
 
+pytestmark = pytest.mark.long
+
 ROBOT = Path(__file__).parents[3] / "robots" / "single_joint.yaml"
 ACTIVE = {"position_trajectory": "false", "posvel_trajectory": "true"}
 PERIOD_NS = 3_125_000

@@ -18,6 +18,8 @@ from dxlrun import Outcome
 from dxlrun_controllers.laws.learning import Repetition, gaussian
 from dxlrun_controllers.motions.ilc_controller import IlcController
 
+pytestmark = pytest.mark.long
+
 PERIOD_S = 0.02
 TICK = math.radians(0.088)
 MOTION_S = 4.0

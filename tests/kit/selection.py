@@ -1,0 +1,171 @@
+"""Selection: the long tests that a run takes.
+
+A file with `pytestmark = pytest.mark.long` has runs through all processes, experiments, or commands of pages.
+Whatever is named on the command line runs as a whole. Of the whole suite everything short runs, and the long
+tests that a change can break:
+
+    git diff --name-only main > changed.txt
+    pytest --changed changed.txt    # and the long tests of rooms that changed, or import what changed
+    pytest --all                    # everything
+
+How a run ends, and what the network is refused, is never marked as long: tests of safety always run.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Collection, Generator, Iterable, Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+LIBRARIES = ("dxlrun", "dxlsim", "dxlwire")
+TESTED = {
+    "analysis": ("dxlrun_analysis",),
+    "bench": ("tests.bench", "dxlwire"),
+    "cli": ("dxlrun.cli", "docs", "robots"),
+    "control": ("dxlrun.control",),
+    "dynamixel": ("dxlrun.dynamixel", "dxlwire"),
+    "hand": ("dxlrun_hand",),
+    "lab": ("dxlrun_lab",),
+    "log": ("dxlrun.log",),
+    "mechanics": ("dxlrun.features.mechanics",),
+    "phidget": ("phidget",),
+    "plugins": ("dxlrun_controllers", "example", "docs"),
+    "robots": ("robots", "dxlrun_controllers", "dxlrun.control", "dxlrun.run"),
+    "run": ("dxlrun.run", "dxlrun.control"),
+    "simulation": ("dxlsim",),
+    "teleop": ("dxlrun_teleop",),
+    "view": ("dxlrun_view",),
+}
+"""Rooms that the long tests of a folder test."""
+
+
+def room_of(module: str) -> str:
+    """Return the room of a module: `dxlwire`, `dxlrun.control`, `dxlrun.features.sensors`, `dxlrun_lab`."""
+    parts = module.split(".")
+    if parts[0] != "dxlrun":
+        return parts[0]
+    return ".".join(parts[: 3 if parts[1:2] == ["features"] else 2])
+
+
+def module_of(path: str) -> str:
+    """Return the module of a product file, or the package of another file next to modules."""
+    parts = list(Path(path).with_suffix("").parts[1:])
+    if "src" in parts:  # a distribution of its own
+        parts = parts[parts.index("src") + 1 :]
+    return ".".join(part for part in parts if part != "__init__")
+
+
+def is_face(module: str) -> bool:
+    """Check for a module that only passes on names, so that its importers import what is behind it."""
+    return module in LIBRARIES or room_of(module) in {"dxlrun.tooling", "dxlrun.testing"}
+
+
+def affected_rooms(paths: Iterable[str]) -> set[str]:
+    """Return the rooms that changed, and those that import what changed directly or through a face."""
+    import grimp
+
+    changed = [path for path in paths if path.startswith(("runtime/", "plugins/"))]
+    rooms = {str(Path(path).parts[0]) for path in paths if path.startswith(("docs/", "robots/"))}
+    rooms |= {"tests.bench" for path in paths if path.startswith("tests/bench/")}
+    modules = {module_of(path) for path in changed}
+    rooms |= {room_of(module) for module in modules if module}
+    packages = {one.parent.name for one in (ROOT / "plugins").glob("*/__init__.py")}
+    graph = grimp.build_graph(*LIBRARIES, *sorted(packages))
+    for module in modules & graph.modules:
+        importers = set(graph.find_modules_that_directly_import(module))
+        for face in filter(is_face, tuple(importers)):
+            importers |= graph.find_modules_that_directly_import(face)
+        rooms |= set(map(room_of, importers))
+    return rooms
+
+
+def affected_files(paths: Collection[str]) -> Iterator[str]:
+    """Yield the long test files that a change can break; `paths` are relative to the repository."""
+    rooms = affected_rooms(paths)
+    kits = [module_of(f"x/{path}") for path in paths if path.startswith("tests/kit/")]
+    for path, text in long_files():
+        if path in paths or not rooms.isdisjoint(TESTED[folder_of(path)]) or any(kit in text for kit in kits):
+            yield path
+
+
+def folder_of(path: str) -> str:
+    """Return the folder of a test file: `control`, or the package of one in `plugins/`."""
+    return Path(path).parts[1]
+
+
+def long_files() -> Iterator[tuple[str, str]]:
+    """Yield the files whose tests are long, with their text."""
+    for base in ("tests", "plugins"):
+        for path in sorted((ROOT / base).rglob("test_*.py")):
+            if re.search(
+                r"^pytestmark = .*pytest\.mark\.long\b", text := path.read_text("utf-8"), re.MULTILINE
+            ):
+                yield str(path.relative_to(ROOT)), text
+
+
+def add_options(parser: pytest.Parser) -> None:
+    """Add the options of the selection to pytest."""
+    group = parser.getgroup("selection")
+    group.addoption("--all", action="store_true", help="run the long tests as well")
+    group.addoption(
+        "--changed", metavar="FILE", help="file with the paths that changed: run their long tests"
+    )
+
+
+class Selection:
+    """Plugin: leaves out long tests, and reports last how many tests were left out and why."""
+
+    def __init__(self, config: pytest.Config) -> None:
+        named = config.args_source is pytest.Config.ArgsSource.ARGS
+        self._everything = named or config.getoption("--all")
+        self._left_out: Counter[str] = Counter()
+        changed = config.getoption("--changed")
+        if changed and not hasattr(config, "workerinput"):
+            config.option.affected = [*affected_files(Path(changed).read_text("utf-8").split())]
+        self._affected = set(getattr(config.option, "affected", ()))
+
+    @pytest.hookimpl(tryfirst=True)
+    def pytest_collection_modifyitems(self, config: pytest.Config, items: list[pytest.Item]) -> None:
+        """Leave out the long tests that no change can break."""
+        if self._everything:
+            return
+        left_out = {
+            item
+            for item in items
+            if item.get_closest_marker("long")
+            and str(item.path.relative_to(config.rootpath)) not in self._affected
+        }
+        config.hook.pytest_deselected(items=[*left_out])
+        items[:] = [item for item in items if item not in left_out]
+
+    def pytest_deselected(self, items: list[pytest.Item]) -> None:
+        """Count what is left out."""
+        for item in items:
+            long = item.get_closest_marker("long") and not self._everything
+            self._left_out["long" if long else "campaign" if item.get_closest_marker("campaign") else ""] += 1
+
+    @pytest.hookimpl(optionalhook=True)
+    def pytest_testnodedown(self, node: object) -> None:
+        """Take the counts of a worker: each has collected all tests."""
+        self._left_out |= Counter(getattr(node, "workeroutput", {}).get("left_out", {}))
+
+    @pytest.hookimpl(wrapper=True, tryfirst=True)
+    def pytest_sessionfinish(self, session: pytest.Session) -> Generator[None, None, None]:
+        """Report what was left out in the last line."""
+        if (output := getattr(session.config, "workeroutput", None)) is not None:
+            output["left_out"] = dict(self._left_out)
+        yield
+        if output is not None:
+            return
+        reasons = {
+            "long": "long tests that no change can break (--all runs them)",
+            "campaign": "campaigns that run at night or for a release (--campaigns lists them)",
+        }
+        parts = [f"{self._left_out[key]} {text}" for key, text in reasons.items() if self._left_out[key]]
+        reporter = session.config.pluginmanager.get_plugin("terminalreporter")
+        if parts and reporter is not None:
+            reporter.write_line(f"left out: {', '.join(parts)}")

@@ -1,0 +1,80 @@
+"""Selection: long tests run where they are named, where all are asked for, or where a change needs them."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from tests.kit import selection
+
+ROOT = Path(__file__).parents[1]
+SHORT = "def test_short():\n    pass\n"
+LONG = "import pytest\npytestmark = pytest.mark.long\ndef test_long():\n    pass\n"
+
+
+@pytest.fixture(name="run")
+def _run(tmp_path: Path):
+    (tmp_path / "pyproject.toml").write_text('[tool.pytest.ini_options]\nmarkers = ["long", "campaign"]\n')
+    (tmp_path / "conftest.py").write_text((ROOT / "tests/conftest.py").read_text())
+    for name, text in (("test_short", SHORT), ("test_long", LONG)):
+        (tmp_path / f"{name}.py").write_text(text)
+    inherited = {name: value for name, value in os.environ.items() if not name.startswith(("PYTEST", "COV_"))}
+    environment = inherited | {"PYTHONPATH": str(ROOT)}
+
+    def run(*words: str) -> list[str]:
+        command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *words]
+        ran = subprocess.run(
+            command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+        )
+        assert ran.returncode == 0, ran.stdout + ran.stderr
+        return ran.stdout.splitlines()
+
+    return run
+
+
+@pytest.mark.parametrize("workers", ["0", "2"])
+def test_whole_suite_leaves_out_long_tests_and_reports_it_last(run, workers: str) -> None:
+    *_, passed, last = run("-n", workers)
+    assert passed.startswith("1 passed")
+    assert last == "left out: 1 long tests that no change can break (--all runs them)"
+
+
+@pytest.mark.parametrize("words", [("--all",), ("test_long.py", "test_short.py"), (".",)])
+def test_all_and_named_paths_run_as_a_whole(run, words: tuple[str, ...]) -> None:
+    assert run("-n", "0", *words)[-1].startswith("2 passed")
+
+
+@pytest.mark.parametrize(
+    ("path", "rooms"),
+    [
+        ("runtime/dxlrun/control/loop.py", {"dxlrun.control", "dxlrun.run"}),
+        ("plugins/dxlrun_lab/stress.py", {"dxlrun_lab"}),
+        ("plugins/dxlrun_view/src/dxlrun_view/web/page.js", {"dxlrun_view"}),
+        ("robots/bioloid_torso.yaml", {"robots"}),
+        ("docs/index.md", {"docs"}),
+        ("tests/bench/cycle_trace.py", {"tests.bench"}),
+        ("README.md", set()),
+    ],
+)
+def test_change_affects_its_room_and_its_importers(path: str, rooms: set[str]) -> None:
+    found = selection.affected_rooms([path])
+    assert rooms <= found
+    assert bool(found) == bool(rooms)
+
+
+def test_importers_through_a_face_are_affected() -> None:
+    assert "dxlrun_analysis" in selection.affected_rooms(["runtime/dxlrun/channels/event_records.py"])
+
+
+def test_changed_test_and_users_of_changed_kit_run() -> None:
+    assert [*selection.affected_files(["tests/hand/test_terminal.py"])] == ["tests/hand/test_terminal.py"]
+    assert "tests/hand/test_terminal.py" in {*selection.affected_files(["tests/kit/hands.py"])}
+
+
+def test_each_room_has_its_long_tests() -> None:
+    files = [path for path, _ in selection.long_files()]
+    assert {selection.folder_of(path) for path in files} == set(selection.TESTED)
+    assert len(files) > 50
