@@ -163,7 +163,7 @@ WRONG = [
     (HEAD % "positions" + POINT % "pan: {position: 2 rad}", "4:35", "pan is sent to 114.59 deg", "change the motion or the limits"),
     (HEAD % "posvel" + POINT % "tilt: {position: 0 rad, velocity: 9 rad/s}", "4:35", "tilt is commanded to 9 rad/s", "allow more time"),
     (HEAD % "positions" + POINT % "tilt: {position: 0 rad}", "4:35", "positions does not move tilt", "known: pan"),
-    (HEAD % "posvel" + POINT % "tilt: {position: 0 rad}", "4:35", "tilt has no target velocity at", "give it one"),
+    (HEAD % "posvel" + POINT % "tilt: {position: 0 rad}", "4:35", "tilt has no target velocity at", "add the velocity"),
     (HEAD % "positions" + POINT % "pan: {position: 0}", "4:51", "0 has no unit", "60 deg"),
     ("name: nod\n", "1:1", "motions", ""),
     ("name: [\n", "1:7", "", ""),

@@ -88,7 +88,7 @@ def check_samples(
             sample.targets[joint].mark,
             f"{joint} is sent to {where} at {(start_ns + sample.t_ns) * 1e-9:.3f} s, outside its limits "
             f"{limits_of(joints[joint])}",
-            "change the motion or the limits; the gate holds the joint at the limit",
+            "the gate holds the joint at the limit; change the motion or the limits",
         )
     for joint, (speed, t_ns, mark) in fastest.items():
         report_speed(joints[joint], speed, f" at {(start_ns + t_ns) * 1e-9:.3f} s", mark, problems)
@@ -105,7 +105,7 @@ def report_speed(joint: JointPlan, speed: float, where: str, mark: Mark, problem
     if excess.beyond_servo:
         problems.error(mark, excess.text, f"{excess.fix}, or shorten the way")
     else:
-        fix = f"{excess.fix}, or raise the limit; the gate limits the speed, so the joint is late"
+        fix = f"the gate limits the speed, so the joint is late; {excess.fix}, or raise the limit"
         problems.warning(mark, excess.text, fix)
 
 
