@@ -1,17 +1,14 @@
 """Campaign: random robots that a scripted hand sets up, calibrates and teaches.
 
 References, directions, limits, IDs, rates, models and the file's layout are random. The file that was written
-is judged byte by byte but for the values, and the values by the servos. CI runs a seeded sample; all of it:
+is judged byte by byte but for the values, and the values by the servos. CI runs a sample; all of it:
 
-    DXLRUN_HANDS=50 DXLRUN_TAUGHT=50 python -m pytest tests/hand/test_hands_campaign.py -q -rP
-
-`DXLRUN_HANDS_SEED` (default 1) is what robots and hands are drawn from.
+    pytest --campaign=release tests/hand/test_hands_campaign.py
 """
 
 from __future__ import annotations
 
 import math
-import os
 import random
 import re
 from collections.abc import Callable
@@ -20,6 +17,7 @@ from pathlib import Path
 
 import pytest
 from tests.hand.test_teach import points, positions
+from tests.kit.campaigns import campaign
 from tests.kit.hands import HandLine, LiveRobot, Script, written
 
 from dxlrun import connect
@@ -33,9 +31,6 @@ from dxlrun_hand.teaching import taught
 from dxlsim.simulation_plan import ServoConfig
 from dxlwire.control_table import ControlTable, find_table
 
-HANDS = int(os.environ.get("DXLRUN_HANDS", "3"))
-TAUGHT = int(os.environ.get("DXLRUN_TAUGHT", "0"))
-SEED = os.environ.get("DXLRUN_HANDS_SEED", "1")
 MODELS = {1.0: ("AX-12A", "MX-28", "MX-64"), 2.0: ("XL430-W250", "XM430-W350", "XL330-M288", "XH540-W150")}
 NAMES = ("shoulder", "elbow", "wrist", "neck", "hip")
 
@@ -154,11 +149,10 @@ def masked(text: str) -> str:
     return re.sub(r"position: \[[-\d.]+ (deg|rad),( +)[-\d.]+ ", r"position: [# \1,\2# ", text)
 
 
-@pytest.mark.campaign
-@pytest.mark.parametrize("number", range(HANDS))
-def test_random_robots_are_set_up_and_calibrated(number: int, tmp_path: Path) -> None:
-    chance = random.Random(f"{SEED} hand {number}")
+@campaign(ci=3, night=12, release=50)
+def test_random_robots_are_set_up_and_calibrated(number: int, chance: random.Random, tmp_path: Path) -> None:
     world = drawn(chance)
+    print(world.text)
     robot = written(tmp_path, world.text)
     line = world.line
     setting_up = Script(
@@ -205,13 +199,14 @@ def test_random_robots_are_set_up_and_calibrated(number: int, tmp_path: Path) ->
         )
 
 
-@pytest.mark.campaign
-@pytest.mark.parametrize("number", range(TAUGHT))
-def test_random_robots_are_taught(number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@campaign(ci=0, night=10, release=50)
+def test_random_robots_are_taught(
+    number: int, chance: random.Random, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """In real time, with a run of its own; its limits are those of the servos."""
-    chance = random.Random(f"{SEED} taught {number}")
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     world = drawn(chance)
+    print(world.text)
     unlimited = re.sub(r"(, |\n +)limits: [^}]*\}", "", world.text).replace("rate: 2}", "rate: 25}")
     robot, target = (
         written(tmp_path, re.sub(r"baud_rate: \d+", "baud_rate: 1000000", unlimited)),

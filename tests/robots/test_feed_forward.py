@@ -6,8 +6,6 @@
 from __future__ import annotations
 
 import math
-import os
-import random
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +13,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 from tests.bench import feed_forward as bench
+from tests.kit.campaigns import campaign
 from tests.kit.clients import Ask, steered
 
 from dxlrun.description.joints.motor_file import motor_text
@@ -26,7 +25,6 @@ pytestmark = pytest.mark.long
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "robots/single_joint_feed_forward.yaml"
 SECONDS = 4.0
-STORMS = max(1, int(os.environ.get("DXLRUN_CHAIN_STORMS", "120")) // 120)
 WITH = bench.POSITIONS.format(scale=1)
 WITHOUT_RMS = 0.050
 """rad, of the MX-64 without feed-forward, which the first test finds"""
@@ -120,10 +118,8 @@ controllers:
 """
 
 
-@pytest.mark.campaign
-@pytest.mark.parametrize("seed", range(STORMS))
-def test_the_gate_keeps_the_limits_whatever_is_added(tmp_path, seed):
-    dice = random.Random(seed)
+@campaign(ci=1, night=8, release=80)
+def test_the_gate_keeps_the_limits_whatever_is_added(tmp_path, number, chance):
     (tmp_path / "known.yaml").write_text(motor_text(bench.MX64, {}))
     (tmp_path / "storm.yaml").write_text(STORM)
     limit = math.radians(60)
@@ -132,7 +128,7 @@ def test_the_gate_keeps_the_limits_whatever_is_added(tmp_path, seed):
             0.5 + 0.03 * k,
             "group",
             "posvel",
-            {"positions": [dice.uniform(-limit, limit)], "velocities": [dice.uniform(0.0, 3.0)]},
+            {"positions": [chance.uniform(-limit, limit)], "velocities": [chance.uniform(0.0, 3.0)]},
         )
         for k in range(100)
     ]

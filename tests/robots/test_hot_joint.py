@@ -1,25 +1,23 @@
 """A joint whose load is more than its servo can carry for long trips, with a thermal_governor it does not.
 
-The sample begins with hot servos that warm ten times as fast. `DXLRUN_HOT_SECONDS=600 pytest -rP
+CI begins with hot servos that warm ten times as fast. `pytest --campaign=release -rP
 tests/robots/test_hot_joint.py` has ten minutes from cold ones on, also for servos that warm twice as fast or
 half as far as the simulation's.
 """
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.kit.campaigns import campaign
 
 from dxlrun.testing import read_log, simulated_robot
 from dxlrun_analysis.replay import replay_log
 from dxlsim.motion import mechanics
 
-SECONDS = float(os.environ.get("DXLRUN_HOT_SECONDS", "18"))
-WHOLE = SECONDS >= 600
 ROBOT = """\
 name: hot
 buses: {{main: {{port: sim, protocol: {protocol}, baud_rate: 1_000_000, adapter: {{kind: direct}}}}}}
@@ -53,14 +51,18 @@ CASES = (
 )
 
 
-def run(case: Case, folder: Path, *, governed: bool) -> tuple[float, bool, Path]:
-    """Return the highest temperature, whether it tripped, and the log."""
+def run(case: Case, folder: Path, seconds: float, *, hot: bool, governed: bool) -> tuple[float, bool, Path]:
+    """Run the robot from cold servos or hot ones on.
+
+    Returns:
+        The highest temperature, whether the servo tripped, and the log.
+    """
     path, log = folder / "robot.yaml", folder / f"{governed}.mcap"
     into = ", into: governor" if governed else ""
     path.write_text(ROBOT.format(**vars(case), into=into, governed=str(governed).lower()))
-    robot = simulated_robot(path, duration_s=SECONDS, log=log)
+    robot = simulated_robot(path, duration_s=seconds, log=log)
     servo = robot.buses[0].servo(1)
-    if not WHOLE:
+    if hot:
         servo.set_temperature(case.limit - 9.0)  # above `warn`: some of its torque is taken
     assert robot.run().detail == ""
     read = read_log(log)
@@ -68,18 +70,17 @@ def run(case: Case, folder: Path, *, governed: bool) -> tuple[float, bool, Path]
     return float(np.nanmax(read.cycles["temperature"])), tripped, log
 
 
-@pytest.mark.campaign
-@pytest.mark.parametrize(
-    "heating", [(1.0, 1.0), (0.5, 1.0), (1.0, 0.5), (2.0, 2.0)] if WHOLE else [(0.1, 1.0)]
-)
-@pytest.mark.parametrize("case", CASES if WHOLE else CASES[::2], ids=lambda case: case.model)
-def test_a_loaded_joint_trips_without_and_not_with_a_governor(case, heating, tmp_path, monkeypatch):
+def check_governor_prevents_trip(
+    case: Case, heating: tuple[float, float], folder: Path, seconds: float, *, hot: bool
+) -> Path:
+    """Run without a governor and with it; return the log of the governed run."""
     slower, hotter = heating
-    monkeypatch.setattr(mechanics, "COOLING_S", mechanics.COOLING_S * slower)
-    monkeypatch.setattr(mechanics, "STALLED_RISE_C", mechanics.STALLED_RISE_C * hotter)
-    highest, tripped, _ = run(case, tmp_path, governed=False)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(mechanics, "COOLING_S", mechanics.COOLING_S * slower)
+        patch.setattr(mechanics, "STALLED_RISE_C", mechanics.STALLED_RISE_C * hotter)
+        highest, tripped, _ = run(case, folder, seconds, hot=hot, governed=False)
+        governed, trips, log = run(case, folder, seconds, hot=hot, governed=True)
     assert tripped or hotter < 1.0  # a weak heater may warm no more
-    governed, trips, log = run(case, tmp_path, governed=True)
     assert not trips
     assert governed <= case.limit - 2.0
     print(f"{case.model} {heating}: {highest:.0f} deg C, tripped {tripped}; governed {governed:.0f} deg C")
@@ -89,7 +90,23 @@ def test_a_loaded_joint_trips_without_and_not_with_a_governor(case, heating, tmp
     assert scale.min() < 0.9
     assert np.abs(np.diff(scale)).max() < 0.05  # smoothly
     assert hotter > 1.0 or scale[-1] > 0.1  # no more than it must
-    if not WHOLE and case.protocol == 1.0:
-        return  # one replay is enough of a sample
+    return log
+
+
+def check_replay(log: Path) -> None:
     report = replay_log(log)
     assert (report.different, report.compared) == (0, report.cycles)
+
+
+@pytest.mark.parametrize("case", CASES[::2], ids=lambda case: case.model)
+def test_hot_servo_trips_without_a_governor_and_not_with_one(case, tmp_path):
+    log = check_governor_prevents_trip(case, (0.1, 1.0), tmp_path, 18.0, hot=True)
+    if case.protocol == 2.0:  # one replay is enough at each commit
+        check_replay(log)
+
+
+@campaign(ci=0, night=600, release=600)
+@pytest.mark.parametrize("heating", [(1.0, 1.0), (0.5, 1.0), (1.0, 0.5), (2.0, 2.0)])
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.model)
+def test_cold_servo_trips_without_a_governor_and_not_with_one(case, heating, tmp_path, amount):
+    check_replay(check_governor_prevents_trip(case, heating, tmp_path, amount, hot=False))

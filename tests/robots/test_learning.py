@@ -2,18 +2,18 @@
 
 CI has a slow loop and few runs. The full one, ten repetitions of the thesis' whole motion at 320 Hz:
 
-    DXLRUN_REPETITIONS=10 python -m pytest tests/robots/test_learning.py -q -rA
+    pytest --campaign=release tests/robots/test_learning.py -rA
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-import os
 from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.kit.campaigns import campaign
 
 from dxlrun.channels.event_records import EventCode
 from dxlrun.compile.motions import LEAD_NS
@@ -25,7 +25,6 @@ pytestmark = pytest.mark.long
 ROBOTS = Path(__file__).parents[2] / "robots"
 ROBOT = ROBOTS / "single_joint_learning.yaml"
 MOTION = ROBOTS / "motions/single_joint_learning.yaml"
-REPETITIONS = int(os.environ.get("DXLRUN_REPETITIONS", "0"))
 HALF_S = 3.0
 QUICK = {"rate": "32"}
 """Hz; 320 takes ten times as long."""
@@ -113,16 +112,15 @@ def test_it_learns_what_a_feed_forward_leaves(tmp_path):
     assert replay_log(path).same
 
 
-@pytest.mark.campaign
+@campaign(ci=0, night=10, release=10)
 @pytest.mark.parametrize("interface", ["position", "posvel"])
-@pytest.mark.skipif(not REPETITIONS, reason="the full campaign: DXLRUN_REPETITIONS=10")
-def test_the_error_of_the_thesis_motion_falls_tenfold(tmp_path, interface):
+def test_the_error_of_the_thesis_motion_falls_tenfold(tmp_path, interface, amount):
     motion = tmp_path / "tracking.yaml"
     text = (ROBOTS / "motions/single_joint_tracking.yaml").read_text()
     motion.write_text(text.replace("controller: posvel_trajectory", "controller: arm"))
     errors = [
         error_of(learned(tmp_path / "kept", tmp_path / "run.mcap", motion, interface=interface), 0.0, 30.0)
-        for _ in range(REPETITIONS + 1)
+        for _ in range(int(amount) + 1)
     ]
     print(f"{interface}: " + ", ".join(f"{error:.3f}" for error in errors) + " deg")
     assert errors[-1] < errors[0] / 10

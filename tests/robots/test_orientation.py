@@ -1,19 +1,19 @@
 """imu_sensor_broadcaster on a simulated body: known rotations within a degree, and drift over minutes.
 
-CI looks at the drift of 8 virtual seconds; `DXLRUN_DRIFT_S=600 pytest tests/robots/test_orientation.py -rA`
-takes ten minutes.
+CI looks at the drift of 8 virtual seconds; `pytest --campaign=release tests/robots/test_orientation.py -rA`
+at that of ten minutes.
 """
 
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from tests.kit.campaigns import campaign
 
 from dxlrun.log.log_reader import Log, read_log
 from dxlrun.testing import simulated_robot
@@ -21,7 +21,6 @@ from dxlrun.testing import simulated_robot
 pytestmark = pytest.mark.long
 
 Array = NDArray[np.float64]
-DRIFT_S = float(os.environ.get("DXLRUN_DRIFT_S", "8"))
 LINK = """<inertial>
     <mass value="0.2"/><inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/>
   </inertial>"""
@@ -141,22 +140,23 @@ def test_known_rotations_are_found_within_a_degree(turned, pose, keys, physics):
     assert np.nanmax(whole) < 10.0  # a sample is up to a cycle old, and the body turns by 200 deg/s and more
 
 
-@pytest.mark.campaign
+@campaign(ci=8, night=60, release=600)
 @pytest.mark.parametrize(
-    ("keys", "magnet", "whole_deg", "heading_deg_s"),
+    ("keys", "eight_seconds_deg", "whole_deg"),
     [
-        ("magnetometer: chip", True, 1.0, 0.0),
-        ("rest: 1 deg/s", False, 3.0 if DRIFT_S > 8 else 0.9, 0.0),  # without its correction 1.1 after 8 s
-        ("gain: 0.1", False, math.inf, 0.5),
+        ("magnetometer: chip", 1.0, 1.0),
+        ("rest: 1 deg/s", 0.9, 3.0),  # without its correction 1.1 after 8 s
+        ("gain: 0.1", math.inf, math.inf),
     ],
     ids=["magnetometer", "rest", "rates"],
 )
-def test_drift_is_bounded(turned, keys, magnet, whole_deg, heading_deg_s):
-    log = turned(BIASED + (", magnetometer: {}" if magnet else ""), keys, (30.0, 20.0, -15.0), DRIFT_S)
+def test_drift_is_bounded(turned, keys, eight_seconds_deg, whole_deg, amount):
+    magnet = ", magnetometer: {}" if keys.startswith("magnetometer") else ""
+    log = turned(BIASED + magnet, keys, (30.0, 20.0, -15.0), amount)
     whole, up = errors(log)
     print(f"{keys}: vertical off by {up[100:].max():.2f} deg, all by {whole[100:].max():.2f} deg")
     assert up[100:].max() < 1.0
-    if heading_deg_s:  # without a second direction the heading drifts by the bias, as the page says
-        assert 0.05 * DRIFT_S < whole[-1] < heading_deg_s * DRIFT_S
-    else:
-        assert whole[100:].max() < whole_deg
+    assert whole[100:400].max() < eight_seconds_deg
+    assert whole[100:].max() < whole_deg
+    if whole_deg == math.inf:  # without a second direction the heading drifts by the bias, as the page says
+        assert 0.05 * amount < whole[-1] < 0.5 * amount

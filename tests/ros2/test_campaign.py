@@ -1,9 +1,8 @@
-"""Restarts of either side, and frames beside pinocchio: a few at each commit, many before a release."""
+"""Restarts of either side, and frames compared with pinocchio."""
 
 from __future__ import annotations
 
 import math
-import os
 import random
 import signal
 from collections.abc import Iterator, Mapping
@@ -14,13 +13,11 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from tests.kit.awaited import DEADLINE_S, until
+from tests.kit.campaigns import campaign
 from tests.ros2.started import ROBOTS, Foreign, Place, Robot, seconds, stamp_ns
 
 ABORTED = 6
 """Of action_msgs/msg/GoalStatus"""
-RESTARTS = int(os.environ.get("DXLRUN_ROS2_RESTARTS", "1"))
-POSES = int(os.environ.get("DXLRUN_ROS2_POSES", "30"))
-SEED = int(os.environ.get("DXLRUN_ROS2_SEED", "1"))
 ELBOW = "right_elbow_joint"
 
 
@@ -46,12 +43,12 @@ def comes(foreign: Foreign, least: int = 10) -> int:
     return since
 
 
-@pytest.mark.campaign
-@pytest.mark.timeout(120 + 60 * RESTARTS)
-def test_either_side_restarts_and_every_stamp_is_the_logs(empty: Place) -> None:
+@campaign(ci=1, night=10, release=50)
+@pytest.mark.timeout(180)
+def test_either_side_restarts_and_every_stamp_is_the_logs(empty: Place, amount: float) -> None:
     robot, bridge, foreign = empty.robot("bioloid_torso"), empty.bridge("bioloid_torso"), empty.foreign()
     foreign.do("hear", "states", "/joint_states", "sensor_msgs/msg/JointState")
-    for number in range(RESTARTS):
+    for number in range(int(amount)):
         comes(foreign)
         bridge.send_signal((signal.SIGKILL, signal.SIGINT)[number % 2])
         bridge.wait()
@@ -101,9 +98,9 @@ def judged_by_the_log(robot: Robot, received: list[Mapping[str, Any]]) -> None:
 # Frames
 
 
-@pytest.mark.campaign
-@pytest.mark.timeout(120 + POSES)
-def test_frames_lie_where_pinocchio_has_them(empty: Place) -> None:
+@campaign(ci=30, night=250, release=1000)
+@pytest.mark.timeout(150)
+def test_frames_equal_those_of_pinocchio(empty: Place, amount: float, chance: random.Random) -> None:
     pin = pytest.importorskip(
         "pinocchio", reason="pin has 380 MB, so CI does not install it: pip install pin"
     )
@@ -115,13 +112,10 @@ def test_frames_lie_where_pinocchio_has_them(empty: Place) -> None:
     for key, words in kinds.items():
         foreign.do("hear", key, *words.split())
     foreign.do("hear", "still", "/tf_static", "tf2_msgs/msg/TFMessage", True, True)
-    drawn, limits = (
-        random.Random(SEED),
-        list(zip(model.lowerPositionLimit, model.upperPositionLimit, strict=True)),
-    )
+    limits = list(zip(model.lowerPositionLimit, model.upperPositionLimit, strict=True))
     joints = [servo.joint for servo in robot.bus.servos]
     order = [model.joints[model.getJointId(joint)].idx_q for joint in joints]
-    rows = [{"data": [0.5 * drawn.uniform(*limits[at]) for at in order]} for _ in range(500)]
+    rows = [{"data": [0.5 * chance.uniform(*limits[at]) for at in order]} for _ in range(500)]
     switched = {
         "activate_controllers": ["whole_body_position"],
         "deactivate_controllers": ["head", "left_arm", "right_arm"],
@@ -133,7 +127,7 @@ def test_frames_lie_where_pinocchio_has_them(empty: Place) -> None:
     judged: set[tuple[float, ...]] = set()
     states: dict[int, Any] = {}
     seen = {"states": 0, "tf": 0}
-    while len(judged) < POSES:
+    while len(judged) < amount:
         new = {key: foreign.do("heard", key, 10, seen[key])["messages"] for key in seen}
         seen = {key: seen[key] + len(new[key]) for key in seen}
         states |= {stamp_ns(one): one for one in new["states"]}

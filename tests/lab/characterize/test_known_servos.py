@@ -6,7 +6,6 @@ The truths come from the simulation: its settings, formulas on them, or its own 
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -30,11 +29,7 @@ FIVE_PERCENT = 0.05
 MS = 1_000_000
 PROTOCOLS = {"AX-12A": 1.0, "MX-64": 1.0, "XL430-W250": 2.0, "XM430-W350": 2.0}
 Measures = Callable[..., Any]
-SERVOS = int(os.environ.get("DXLRUN_CHARACTERIZE_SERVOS", "0"))
-campaign = [
-    pytest.mark.campaign,
-    pytest.mark.skipif(not SERVOS, reason="the campaign: DXLRUN_CHARACTERIZE_SERVOS=1"),
-]
+campaign = pytest.mark.campaign(ci=0, night=1, release=1)
 CYCLE_S = 1 / 240
 READ, SYNC_WRITE = 0x02, 0x83
 

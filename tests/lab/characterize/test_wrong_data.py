@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable
 from fractions import Fraction
 from typing import Any
 
 import numpy as np
 import pytest
+from tests.kit.campaigns import campaign
 
 from dxlrun_lab.characterize import characterization_tables, dead_band, gaps, rates, response, speeds
 from dxlrun_lab.characterize.joint_figure import JointFigure
@@ -161,10 +161,7 @@ def test_a_range_that_is_too_small_is_named_with_one_that_would_do(measures):
     assert done.figure(speeds.ACCELERATION).value is not None
 
 
-@pytest.mark.campaign
-@pytest.mark.skipif(
-    "DXLRUN_CHARACTERIZE_SERVOS" not in os.environ, reason="the campaign: DXLRUN_CHARACTERIZE_SERVOS=1"
-)
+@campaign(ci=0, night=1, release=1)
 @pytest.mark.parametrize("model", ["AX-12A", "MX-64"])
 def test_the_range_that_is_named_does(measures, model):
     why = measures(["speed"], model, reach=0.2).figure(speeds.TOP).why

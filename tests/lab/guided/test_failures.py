@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import random
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+from tests.kit.campaigns import campaign
 
 from dxlrun.channels.commands import LOOP, CommandMessage
 from dxlrun.errors import DxlrunError, Refused
@@ -21,8 +21,6 @@ from dxlrun_lab.guided.rig import RunningController
 from dxlrun_lab.guided.segment import Guard, Segment
 from dxlsim.faults.fault import parse_fault
 from dxlsim.faults.script import FaultScript
-
-ABORTS = int(os.environ.get("DXLRUN_EXPERIMENT_ABORTS", "3"))
 
 
 def happen(rig: Any, fault: str) -> None:
@@ -235,15 +233,16 @@ def many(stage: Any, rng: random.Random) -> Any:
     return segments
 
 
-@pytest.mark.campaign
-@pytest.mark.parametrize("seed", range(ABORTS))
-def test_an_abort_at_any_time_leaves_the_run_as_it_was(stage, seed):
-    """However far it came: on the way to a start, in a segment, while modes change or a player is loaded."""
-    rng = random.Random(seed)
+@campaign(ci=3, night=40, release=200)
+def test_an_abort_at_any_time_leaves_the_run_as_it_was(stage, number, chance):
+    """On the way to a start, in a segment, while modes change or a player is loaded."""
     rig = stage.rig(stage.arm)
-    at_s = rig.now_s + rng.uniform(0.0, 9.0)
-    lost_s = rig.now_s + rng.uniform(0.0, 9.0)
-    if seed % 3 == 2:  # and a servo that is lost, and back before all is restored
+    begin_s = rig.now_s
+    at_s = begin_s + chance.uniform(0.0, 9.0)
+    lost_s = begin_s + chance.uniform(0.0, 9.0)
+    loses = number % 3 == 2  # a servo, which is back before all is restored
+    print(f"aborted after {at_s - begin_s} s, lost after {lost_s - begin_s if loses else None} s")
+    if loses:
         rig.robot.link.simulated.buses[0].at(
             round(lost_s * 1e9), lambda: happen(rig, "silence servo=2 for=200ms")
         )
@@ -251,7 +250,7 @@ def test_an_abort_at_any_time_leaves_the_run_as_it_was(stage, seed):
     def abort():
         return "aborted by a key" if rig.now_s >= at_s else None
 
-    _, done = stage.perform(rig, "elbow", many(stage, rng), abort)
+    _, done = stage.perform(rig, "elbow", many(stage, chance), abort)
     assert done.why == "" or done.why.startswith(("aborted by a key", "the servo of", "joint elbow has not"))
     assert all(part.whole for part in done.recorded[:-1])
     assert not rig.robot.link.simulated.robot.loop.steering.inbox.drain_commands()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import random
 import signal
 import socket
 import struct
@@ -19,6 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.kit.awaited import DEADLINE_S, until
+from tests.kit.campaigns import campaign
 from tests.kit.experiments import ROOT
 
 import dxlrun
@@ -37,7 +37,6 @@ from dxlrun_lab.guided.segment import Segment
 
 pytestmark = pytest.mark.long
 
-INTERRUPTS = int(os.environ.get("DXLRUN_EXPERIMENT_INTERRUPTS", "0"))
 CODE = "import sys; from dxlrun.cli import main; sys.exit(main())"
 ROBOT = """\
 name: pair
@@ -321,19 +320,20 @@ sys.exit(ran.exit_code)
 """
 
 
-@pytest.mark.campaign
-@pytest.mark.parametrize("seed", range(INTERRUPTS))
-def test_a_signal_at_any_time_ends_the_run_of_its_own_in_order(place, seed):
-    """In the start, in the middle, in the end, and when it is killed: nothing is left of the run."""
-    rng, before = random.Random(seed + 1), set(place.glob("logs/*.mcap"))
+@campaign(ci=0, night=10, release=50)
+def test_a_signal_at_any_time_leaves_nothing_of_the_run(place, number, chance):
+    """In the start, in the middle, in the end, and when it is killed."""
+    before = set(place.glob("logs/*.mcap"))
     script = SCRIPT.format(root=str(ROOT))
     others = set(sockets())
     words = [sys.executable, "-c", script]
     process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert process.stdout is not None
     assert process.stdout.readline() == "ready\n"
-    time.sleep(rng.uniform(0.0, 8.0))  # when is what the test is about
-    ends = rng.choice([signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+    after_s = chance.uniform(0.0, 8.0)
+    ends = chance.choice([signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+    print(f"{ends.name} after {after_s} s")
+    time.sleep(after_s)  # when is what the test is about
     process.send_signal(ends)
     _, said = process.communicate(timeout=DEADLINE_S)
     assert process.returncode in (0, 130, -ends), said

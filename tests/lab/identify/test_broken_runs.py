@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
+from tests.kit.campaigns import campaign
 
 from dxlrun.channels.cycle import Torque
 from dxlrun.errors import InputError
@@ -20,11 +20,6 @@ from dxlwire.modes import Mode
 pytestmark = pytest.mark.long
 
 LOAD = KnownLoad(0.005, 0.3)
-RUNS = int(os.environ.get("DXLRUN_IDENTIFY_RUNS", "0"))
-CAMPAIGN = (
-    pytest.mark.campaign,
-    pytest.mark.skipif(not RUNS, reason="the campaign: DXLRUN_IDENTIFY_RUNS"),
-)
 
 
 def set_to(**columns: Any) -> Callable[[Any], None]:
@@ -54,7 +49,7 @@ def to_and_fro(cycles: Any) -> Any:
             set_to(goal_position=lambda cycles: np.roll(cycles["goal_position"][:, 0], len(cycles) // 3)),
             None,
             "no servo model fits",
-            marks=CAMPAIGN,
+            marks=pytest.mark.campaign(ci=0, night=1, release=1),
         ),
     ],
 )
@@ -73,12 +68,18 @@ def test_a_run_without_voltage_takes_the_given_one(xl330):
     assert measured(cycles, 0, xl330.servo, voltage=5.0).voltage[0] == 5.0
 
 
-def test_a_servo_that_is_lost_in_the_middle(xl330):
+def lost_for_two_seconds(xl330: Any) -> tuple[Any, slice]:
+    """Return the cycles of a run whose servo was lost in the middle, and the rows of that."""
     cycles = xl330.cycles
     lost = slice(len(cycles) // 3, len(cycles) // 3 + 400)  # 2 s
     cycles["torque"][lost] = Torque.LOST
     cycles["valid"][lost] = False
     cycles["position"][lost, 0] = cycles["position"][lost.start, 0]
+    return cycles, lost
+
+
+def test_two_seconds_of_a_lost_servo_are_skipped(xl330):
+    cycles, lost = lost_for_two_seconds(xl330)
     run = measured(cycles, 0, xl330.servo)
     assert run.lost_s == pytest.approx(2.0, abs=0.2)
     begin, end = (
@@ -87,10 +88,14 @@ def test_a_servo_that_is_lost_in_the_middle(xl330):
     (group,) = run.groups
     spans = zip(group.pieces.start_s, group.pieces.start_s + 1.5, strict=True)
     assert all(last <= begin + 0.01 or first >= end - 0.01 for first, last in spans)
-    if RUNS:
-        found = identified(run, fit_run(run), LOAD, "test")
-        assert found.motor.torque_constant == pytest.approx(0.38042, rel=0.08)
-        assert any("were skipped" in note for note in found.notes)
+
+
+@campaign(ci=0, night=1, release=1)
+def test_servo_that_was_lost_for_two_seconds_is_identified(xl330):
+    run = measured(lost_for_two_seconds(xl330)[0], 0, xl330.servo)
+    found = identified(run, fit_run(run), LOAD, "test")
+    assert found.motor.torque_constant == pytest.approx(0.38042, rel=0.08)
+    assert any("were skipped" in note for note in found.notes)
 
 
 def test_a_servo_with_an_integral_part(xl330):
@@ -100,8 +105,7 @@ def test_a_servo_with_an_integral_part(xl330):
         measured(xl330.cycles, 0, declared)
 
 
-@pytest.mark.campaign
-@pytest.mark.skipif(not RUNS, reason="the campaign: DXLRUN_IDENTIFY_RUNS")
+@campaign(ci=0, night=1, release=1)
 def test_an_ax_12_without_a_current_has_the_manuals_scale(record):
     run = record("AX-12A", 1.0, seconds=12.0)
     data = measured(run.cycles, 0, run.servo)

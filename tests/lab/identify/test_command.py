@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import os
 import re
 from pathlib import Path
 
 import pytest
 from tests.kit.answers import result_of
+from tests.kit.campaigns import campaign
 from tests.kit.experiments import ROBOTS, commands_of
 
 from dxlrun.description.joints.motor_file import read_motor
 
 pytestmark = pytest.mark.long
 
-RUNS = int(os.environ.get("DXLRUN_IDENTIFY_RUNS", "0"))
 ROBOT = ROBOTS / "single_joint.yaml"
 OF_THE_PAGE = commands_of("experiments.md", "identify", "## Identify\n")
 
@@ -48,8 +47,7 @@ def test_a_virtual_robot_is_moved_and_its_motor_file_written(dxlrun, here):
     assert motor.read_text() == text
 
 
-@pytest.mark.campaign
-@pytest.mark.skipif(not RUNS, reason="the campaign: DXLRUN_IDENTIFY_RUNS")
+@campaign(ci=0, night=1, release=1)
 def test_a_log_as_json(xl330, dxlrun):
     said = dxlrun("identify", "--recorded", xl330.log.path, "--load-inertia", 0.005, "--json")
     assert said.code == 0, said.err

@@ -33,7 +33,7 @@ from dxlwire.modes import Mode
 
 pytestmark = pytest.mark.long
 
-RECORDINGS = os.environ.get("DXLRUN_BAM_RECORDINGS", "0")
+RECORDINGS = os.getenv("DXLRUN_BAM_RECORDINGS", "")
 TICK = math.tau / 4096
 MASS, LENGTH, G = 0.49, 0.1, 9.80665
 
@@ -122,8 +122,7 @@ def recording(files: Sequence[Path], p_gain: int) -> NDArray[np.void]:
     return np.concatenate(parts)
 
 
-@pytest.mark.campaign
-@pytest.mark.skipif(RECORDINGS == "0", reason="the recordings: DXLRUN_BAM_RECORDINGS")
+@pytest.mark.skipif(not RECORDINGS, reason="DXLRUN_BAM_RECORDINGS names no folder of recordings")
 @pytest.mark.parametrize("p_gain", [100, 200, 400])
 def test_the_recordings_of_a_real_xl330(p_gain):
     table = dataclasses.replace(find_table("XL330-M288", 2.0), effort_unit="1")

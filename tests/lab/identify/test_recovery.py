@@ -3,17 +3,17 @@
 CI identifies an XL330 from 14 s (and test_published.py an MX-64); the campaign each model from the 60 s that
 are the default, and counts how often the intervals have the true value:
 
-    DXLRUN_IDENTIFY_RUNS=40 python -m pytest tests/lab/identify/test_recovery.py -q
+    pytest --campaign=release tests/lab/identify/test_recovery.py
 """
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
+from tests.kit.campaigns import campaign
 
 from dxlrun.description.joints.motor_file import motor_text, read_motor
 from dxlrun_lab.identify.fit import fit_run
@@ -24,7 +24,6 @@ from dxlsim.motion.motor import Motor
 pytestmark = pytest.mark.long
 
 GRAVITY, INERTIA = 0.3, 0.005
-RUNS = int(os.environ.get("DXLRUN_IDENTIFY_RUNS", "0"))
 LOAD = KnownLoad(INERTIA, GRAVITY)
 Record = Callable[..., Any]
 
@@ -60,8 +59,7 @@ def check_constants(found: IdentifiedServo, motor: Motor, within: float) -> None
     assert not wrong
 
 
-@pytest.mark.campaign
-@pytest.mark.skipif(not RUNS, reason="the campaign: DXLRUN_IDENTIFY_RUNS")
+@campaign(ci=0, night=1, release=1)
 def test_an_mx_64_without_a_current_by_a_known_weight(mx64):
     found = result_of(mx64, mx64.noisy(1))
     assert (found.scale, found.friction_model) == ("load", "m3")
@@ -104,9 +102,7 @@ def test_a_servo_simulated_from_the_motor_file_repeats_the_run(xl330, of_xl330, 
     assert np.sqrt(np.mean(np.square(apart))) > 0.02
 
 
-@pytest.mark.campaign
-@pytest.mark.skipif(not RUNS, reason="the campaign: DXLRUN_IDENTIFY_RUNS")
-@pytest.mark.timeout(600)
+@campaign(ci=0, night=1, release=1)
 @pytest.mark.parametrize(
     ("model", "protocol", "rate"),
     [("MX-64", 1.0, 200), ("MX-106", 1.0, 320), ("XL330-M288", 2.0, 100), ("XM430-W350", 2.0, 250)],
@@ -116,12 +112,10 @@ def test_sixty_noisy_seconds_of_each_model(record, model, protocol, rate):
     check_constants(result_of(run, run.noisy(3)), run.servo.built_in, 0.05)
 
 
-@pytest.mark.campaign
-@pytest.mark.skipif(not RUNS, reason="the campaign: DXLRUN_IDENTIFY_RUNS")
-@pytest.mark.timeout(3600)
-def test_intervals_have_the_true_value_as_often_as_they_say(mx64, xl330):
+@campaign(ci=0, night=8, release=40)
+def test_intervals_have_the_true_value_as_often_as_they_claim(mx64, xl330, amount):
     inside = {}
-    for seed in range(RUNS):
+    for seed in range(int(amount)):
         for run in (mx64, xl330):
             found = result_of(run, run.noisy(100 + seed, position_ticks=3.0, effort=0.05))
             true = true_figures(run.servo.built_in)
