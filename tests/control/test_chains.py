@@ -100,7 +100,7 @@ def test_what_is_read_without_a_claim_is_of_this_cycle(robot):
 @pytest.mark.parametrize("name", ["j7/position", "j0/torque", "upper/j0/position", "position", "a/b/c/d"])
 def test_what_is_not_there_cannot_be_read(robot, name):
     robot.script("eye", joints=(), command=(), reads=(name,))
-    with pytest.raises(ControllerFault, match=f"controller eye reads {name}, which does not exist"):
+    with pytest.raises(ControllerFault, match=f"controller eye reads {name}, but no source has it"):
         robot.build()
 
 

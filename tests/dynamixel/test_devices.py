@@ -187,7 +187,7 @@ def test_a_device_is_found_again_on_a_bus_without_idle_time_for_it():
         assert rig.states.valid.all()
     assert rig.sources.valid.all()
     (text,) = rig.events.texts(EventCode.OVERRUN)
-    assert text.startswith("the return of device_0 (ID 101 on bus main) waits for idle time")
+    assert text.startswith("the return of device_0 (ID 101 on bus main) needs up to ")
 
 
 @pytest.mark.parametrize("fast", [True, False])

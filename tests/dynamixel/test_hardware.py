@@ -323,7 +323,7 @@ def test_a_servo_whose_torque_fits_no_gap_gets_its_goals_back_all_the_same():
     assert sent.count(torque_read(rig.plans[0], 1)) == 1
     ((source, text),) = rig.events.of(EventCode.OVERRUN)
     assert source == "main_2_joint"
-    assert "waits for idle time" in text
+    assert "of idle time, but a cycle leaves only" in text
 
 
 @pytest.mark.parametrize("step", [0.05, -0.05])

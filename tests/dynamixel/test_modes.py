@@ -613,4 +613,4 @@ def test_a_mode_is_entered_though_no_cycle_leaves_time_for_it():
         rig.hardware.write_goals()
         rig.wait(1_000_000)
     assert rig.states.mode.tolist() == [V, P]
-    assert "waits for idle time" in rig.events.texts(EventCode.OVERRUN)[0]
+    assert "of idle time, but a cycle leaves only" in rig.events.texts(EventCode.OVERRUN)[0]

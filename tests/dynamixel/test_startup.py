@@ -145,7 +145,7 @@ def test_two_servos_of_one_id_are_named(delay_ns):
     rig = make_rig(extra=(ServoConfig(5, "AX-12A", 0.7, delay_ns),))
     problems = refusal(rig)
     assert all("ID 5" in problem for problem in problems)
-    assert "do two servos have its ID?" in problems[0] or "two servos of one ID" in problems[0]
+    assert "do two servos have its ID?" in problems[0] or "two servos with one ID" in problems[0]
 
 
 @pytest.mark.parametrize(
