@@ -104,6 +104,6 @@ def test_feature_that_fails_at_the_end_leaves_the_others_safe(
     )
     end = SafeEnd.import_stages((Feature(name, f"{name}_feature", f"{name} 1.0"), NOTED), {})
     assert end.make_safe(started().hardware._lines) == (
-        f"the section {name} was not left safe ({raised}); report it to the author of {name} 1.0",
+        f"section {name} failed to set its safe state ({raised}); report it to the author of {name} 1.0",
         "1 lines, ",
     )

@@ -191,7 +191,7 @@ WRONG = {
     ),
     "no controller": (
         ("(JointController)", ""),
-        "; wave.py offers Wave as ./wave.py:Wave, which is not a controller",
+        "; wave.py offers Wave as ./wave.py:Wave: it is not a controller",
     ),
     "no law": (
         ("def positions", "def position_s"),
@@ -199,7 +199,7 @@ WRONG = {
     ),
     "a law without dt": (
         (", dt: float", ""),
-        "whose positions(time) cannot be called as positions(time, dt)",
+        "its positions(time) cannot be called as positions(time, dt)",
     ),
     "a field without a type": (
         (": Angle = 0.3", " = 0.3"),

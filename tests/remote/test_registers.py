@@ -155,7 +155,7 @@ def test_what_cannot_be_switched_does_not_reach_the_loop(arm, path, body, status
     [
         ("/joints/pen", "there is no joint pen; did you mean pan?"),
         ("/joints/pen/registers/led", "there is no joint pen; did you mean pan?"),
-        ("/joints/pan/registers/lad", "pan: XM430-W350 has no register lad; did you mean led?"),
+        ("/joints/pan/registers/lad", "pan: an XM430-W350 has no register lad; did you mean led?"),
         ("/joints/pan/registers/nonsense", "`dxlrun models XM430-W350` lists them"),
     ],
 )

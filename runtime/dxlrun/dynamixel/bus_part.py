@@ -190,6 +190,6 @@ class SafeEnd(msgspec.Struct, frozen=True):
                     f"; report it to the author of {feature.distribution}" if feature.distribution else ""
                 )
                 sentences.append(
-                    f"the section {feature.name} was not left safe ({type(error).__name__}: {error}){author}"
+                    f"section {feature.name} failed to set its safe state ({type(error).__name__}: {error}){author}"
                 )
         return tuple(sentences)
