@@ -106,7 +106,7 @@ def test_what_is_not_there_cannot_be_read(robot, name):
 
 def test_a_reference_that_none_or_two_of_those_below_export_cannot_be_commanded(robot):
     robot.script("lower", joints=("j0",), **LOWER).script("upper", **UPPER)
-    with pytest.raises(ControllerFault, match="upper commands j1/position, which none of lower exports"):
+    with pytest.raises(ControllerFault, match="upper commands j1/position, but none of lower exports it"):
         robot.build()
     robot, one = Robot(), {"joints": ("j0",)}
     for name in ("left", "right"):

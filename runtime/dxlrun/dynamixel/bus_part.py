@@ -189,7 +189,6 @@ class SafeEnd(msgspec.Struct, frozen=True):
                 author = (
                     f"; report it to the author of {feature.distribution}" if feature.distribution else ""
                 )
-                sentences.append(
-                    f"section {feature.name} failed to set its safe state ({type(error).__name__}: {error}){author}"
-                )
+                raised = f"{type(error).__name__}: {error}"
+                sentences.append(f"section {feature.name} failed to set its safe state ({raised}){author}")
         return tuple(sentences)
