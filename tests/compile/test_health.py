@@ -107,8 +107,8 @@ def test_a_group_has_its_own_policy_for_a_lost_servo(
     events = read_log(Path("run.mcap")).events
     assert any(event.code == EventCode.SERVO_LOST and event.source == "tilt" for event in events)
     back = [event.text for event in events if event.code == EventCode.SERVO_BACK]
-    ends = {"hold": ["with its torque and its goal as before"], "limp": ["limp: it gets no goals"]}
-    assert [said.rpartition(", ")[2] for said in back] == ends.get(word, [])
+    ends = {"hold": [", with its torque and its goal as before"], "limp": [" and limp: it gets no goals"]}
+    assert [said.rpartition(" is back")[2] for said in back] == ends.get(word, [])
 
 
 def test_a_rate_at_which_the_watchdog_would_stop_the_servos_is_refused() -> None:

@@ -112,7 +112,7 @@ def test_a_reference_that_none_or_two_of_those_below_export_cannot_be_commanded(
     for name in ("left", "right"):
         robot.script(name, active=name == "left", **LOWER, **one)
     robot.script("upper", into=("left", "right"), **CHAINED, **one)
-    with pytest.raises(ControllerFault, match="j0/position, which more than one of left, right exports"):
+    with pytest.raises(ControllerFault, match="j0/position, but more than one of left, right exports"):
         robot.build()
 
 

@@ -259,7 +259,7 @@ def test_every_event_leads_from_every_state_to_another_or_is_a_fault(robot, stat
         assert event in (ControllerEvent.ENTER, ControllerEvent.COMMAND), (
             "what is called without a fallback fits every state"
         )
-        with pytest.raises(ControllerFault, match=f"one is {state.value}, where {event.value} cannot happen"):
+        with pytest.raises(ControllerFault, match=f"one is {state.value}; {event.value} is invalid in"):
             managed.on(event)
         assert managed.state is state
 
@@ -272,7 +272,7 @@ def test_a_command_for_a_controller_that_is_not_active_ends_no_loop_but_is_its_f
         robot.run(3, {1: lambda: manager._attempt(asleep, asleep.give_command, "go", np.zeros(1))}).cycles
         == 3
     )
-    fault = ("asleep", "controller asleep is inactive, where a command cannot happen")
+    fault = ("asleep", "controller asleep is inactive; a command is invalid in this state")
     assert robot.events.of(EventCode.CONTROLLER_FAULT) == [fault]
     assert robot.active(2) == ["one"]
     assert robot.result.reason == "stopped"

@@ -188,4 +188,4 @@ def test_replay_without_the_package_says_so(tmp_path: Path, monkeypatch: pytest.
     assert features[-1].distribution == "dxlrun-hot 1.0"
     monkeypatch.setattr("dxlrun.features.installed_features", lambda: features[:-1])
     report = replay_log(tmp_path / "run.mcap")
-    assert [remark for remark in report.remarks if "dxlrun-hot 1.0, which is not installed" in remark]
+    assert [remark for remark in report.remarks if "dxlrun-hot 1.0; it is not installed" in remark]
