@@ -134,7 +134,7 @@ def test_a_package_refuses_another_version_of_dxlrun(
     assert ran.returncode == 2, ran.stderr
     assert "Traceback" not in ran.stderr
     said = " ".join(ran.stderr.split())
-    assert f"{dashed} {OTHER} fits dxlrun {OTHER} only, and dxlrun {own} is installed" in said
+    assert f"{dashed} {OTHER} needs dxlrun {OTHER}, but dxlrun {own} is installed" in said
     assert f"`pip install {dashed}=={own}`" in said
 
 
@@ -145,4 +145,4 @@ def test_a_package_of_the_same_version_starts(tmp_path: Path) -> None:
     ran = started("dxlrun_view", tmp_path / "site")
     assert ran.returncode == 2
     assert "nothing.mcap" in ran.stderr
-    assert "fits dxlrun" not in ran.stderr
+    assert "needs dxlrun" not in ran.stderr
