@@ -233,6 +233,10 @@ def test_header_shows_voltage_hottest_servo_and_errors_first(serve: Serve, brows
     browser.until(f"{figures}[2] === 'Errors 1 event'")
     robot.begin(hardware_error=(0, 32), torque=(1, 1))
     browser.until(f"{figures}[2] === 'Errors Overload error wrist'")
+    robot.begin(hardware_error=(0, 37), torque=(1, 1))
+    browser.until(f"{figures}[2] === 'Errors Input voltage error + 2 wrist'")
+    tag = "document.querySelector('#joints .tag.bad').textContent"
+    assert browser.value(tag) == "input voltage error; overheating error; overload error"
     # The control table of the elbow's servo is unknown.
     robot.begin(hardware_error=(33, 0), torque=(1, 1))
     browser.until(f"{figures}[2] === 'Errors Error 0x21 elbow'")

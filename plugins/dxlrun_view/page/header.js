@@ -52,7 +52,8 @@ function drawFigures() {
 
 function errorsOf(faults, events) {
   const title = [...faults.map(([name, word]) => `${name}: ${word}`), ...events.slice(-3).map(({ text }) => text), "Click to show the events"].join("\n");
-  if (faults.length) return { text: faults[0][1], about: faults.length > 1 ? `and ${faults.length - 1} more` : shortOf(faults[0][0]), tone: "bad", title };
+  const [first, ...rest] = faults.length ? faults[0][1].split("; ") : [];
+  if (first) return { text: rest.length ? `${first} + ${rest.length}` : first, about: faults.length > 1 ? `and ${faults.length - 1} more` : shortOf(faults[0][0]), tone: "bad", title };
   if (events.length) return { text: `${events.length} event${events.length > 1 ? "s" : ""}`, tone: "bad", title };
   return value("loop/cycle") === null ? { text: "–" } : { text: "None", tone: "good", title };
 }
