@@ -1,14 +1,12 @@
 """Devices while the line and everything on it fails: no state is old or another's, and servos pay nothing.
 
-`DXLRUN_DEVICE_STORMS` is the number of seeds, 2 in CI; a storm is 200 cycles, and what it takes to recover.
+A storm is 200 cycles and 160 to recover; CI runs two, `pytest --campaign=release FILE` 400.
 """
 
-import os
-import random
 from functools import partial
 
 import numpy as np
-import pytest
+from tests.kit.campaigns import campaign
 from tests.kit.rigs import make_plan, start_rig
 
 from dxlrun.channels.event_records import EventCode
@@ -17,7 +15,6 @@ from dxlsim.faults.script import FaultScript
 
 from .test_devices import ALL, NONE, SERVOS, device, devices
 
-STORMS = int(os.environ.get("DXLRUN_DEVICE_STORMS", "2"))
 LOSSES = ("lose servo={id}", "truncate servo={id} keep={keep}", "corrupt servo={id}")
 WORSE = ("delay servo={id} by={by}us", "duplicate servo={id}", "noise size={keep}", "lose from=host")
 ITEMS = (("speed",), ("speed", "rate"), ("speed", "led"), ("speed", "pwm", "warm", "led"))
@@ -43,11 +40,9 @@ def node(rig, servo_id):
     return rig.servo(servo_id)
 
 
-@pytest.mark.campaign
-@pytest.mark.parametrize("seed", range(STORMS))
-def test_a_storm_makes_no_state_old_and_costs_the_servos_nothing(seed):
-    chance = random.Random(seed)
-    only_devices = seed % 2 == 0
+@campaign(ci=2, night=50, release=400)
+def test_a_storm_makes_no_state_old_and_costs_the_servos_nothing(number, chance):
+    only_devices = number % 2 == 0
     capabilities = chance.choice((ALL, NONE, '["sync_read"]', '["bulk_read"]'))
     wanted = [chance.choice(ITEMS) for _ in range(chance.randrange(1, 5))]
     plan = make_plan(
@@ -66,10 +61,10 @@ def test_a_storm_makes_no_state_old_and_costs_the_servos_nothing(seed):
     columns = {each.source: each.blocks[-1].fields[-1].column for each in plan.devices}
     ages = np.zeros(len(wanted), dtype=np.int64)
 
-    def cycle(number):
+    def run_cycle(cycle):
         for index in range(len(wanted)):
-            device(rig, index).registers["profile_velocity"] = 100 * number + index
-        rig.goals.position[:] += 0.001 * (-1) ** number
+            device(rig, index).registers["profile_velocity"] = 100 * cycle + index
+        rig.goals.position[:] += 0.001 * (-1) ** cycle
         try:
             rig.cycle()
         except AssertionError:  # a cycle that is late: only a servo may make it so
@@ -77,7 +72,7 @@ def test_a_storm_makes_no_state_old_and_costs_the_servos_nothing(seed):
             rig.clock.wait_until(rig.clock.now_ns() + 1_000_000)
         for row, column in columns.items():
             if rig.sources.valid[row]:
-                assert rig.sources.values[column] == 100 * number + row
+                assert rig.sources.values[column] == 100 * cycle + row
                 assert 0 <= rig.sources.age_ns[row] < 12_000_000
             else:
                 assert rig.sources.age_ns[row] > ages[row]
@@ -85,14 +80,14 @@ def test_a_storm_makes_no_state_old_and_costs_the_servos_nothing(seed):
         if only_devices:
             assert rig.states.valid.all()
 
-    for number in range(200):
+    for cycle in range(200):
         for _ in range(chance.choice((0, 0, 0, 1, 2))):
             storm(rig, chance, ids, kinds)
-        cycle(number)
+        run_cycle(cycle)
     for servo_id in ids:  # behind what the storm has still to do
         rig.buses[0].at(rig.clock.now_ns(), partial(node(rig, servo_id).silence, on=False))
-    for number in range(200, 360):
-        cycle(number)
+    for cycle in range(200, 360):
+        run_cycle(cycle)
     assert rig.sources.valid.all()
     assert rig.states.valid.all()
     assert rig.packets.sent() == rig.into_bus()

@@ -13,6 +13,7 @@ from threading import Thread, Timer
 
 import numpy as np
 import pytest
+from tests.kit.campaigns import campaign
 from tests.kit.line_faults import turn_by_hand
 from tests.kit.loaded import loaded
 from tests.kit.rigs import make_plan, make_rig, start_rig
@@ -121,9 +122,9 @@ def test_the_replies_of_two_lines_have_room_in_the_log_beside_one_another():
     assert side.ended > 90
 
 
-@pytest.mark.campaign
-def test_kernel_and_parser_agree_on_many_streams():
-    fuzz.campaign(int(os.environ.get("DXLRUN_STREAMS", "1500")), seed=int(os.environ.get("DXLRUN_SEED", "1")))
+@campaign(ci=1500, night=200_000, release=2_000_000)
+def test_kernel_and_parser_agree_on_many_streams(amount, chance):
+    fuzz.campaign(int(amount), seed=chance.getrandbits(32))
 
 
 def test_an_object_that_is_absent_or_of_another_source_is_refused(tmp_path, monkeypatch):

@@ -1,20 +1,22 @@
 """Replies that are late, doubled or lost, in pairs: no tool and no event reports a value that was not read.
 
 Each program is run without a fault first, on a servo whose registers have distinct values. With faults it may
-report less, and silence as silence, but nothing else. `DXLRUN_LATE_REPLIES` is the number of pairs of each
-program, 40 in CI; `all` runs every pair of kinds and of requests up to eight apart.
+report less, and silence as silence, but nothing else. CI runs 40 pairs of each program. The full campaign has
+every pair of kinds, and of requests up to eight apart:
+
+    pytest --campaign=release tests/dynamixel/test_late_replies.py
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-import os
 import random
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import pytest
+from tests.kit.campaigns import campaign
 from tests.kit.line_faults import STALLED, disturb_replies
 from tests.kit.rigs import VirtualLine, make_plan, make_rig, start_rig
 
@@ -30,7 +32,7 @@ from dxlwire.bus_plan import BusPlan
 from dxlwire.control_table import find_table
 from dxlwire.plan.planning import Wiring, bus_plan
 
-COUNT = os.environ.get("DXLRUN_LATE_REPLIES", "40")
+EVERY_PAIR = 1_000_000  # more than there are
 FARTHEST = 8  # Requests between two faults: later, the first one is over
 KINDS = {
     "lost": PacketFault("lost", lambda _: b""),
@@ -225,26 +227,28 @@ def set_up(protocol: float, faults: Faults) -> tuple[set[str], int]:
 PROGRAMS = [refused_start, start, look_again, inspect_online, servo, scan_line, set_up]
 
 
-def pairs(program: str, protocol: float, replies: int) -> list[tuple[tuple[int, str], tuple[int, str]]]:
-    """Return all pairs of faults, or a sample of them that stays the same."""
+def draw_pairs(
+    replies: int, amount: float, chance: random.Random
+) -> list[tuple[tuple[int, str], tuple[int, str]]]:
+    """Return so many pairs of faults, or all that there are."""
     every = [
         ((first, one), (second, other))
         for first in range(replies)
         for second in range(first + 1, min(first + 1 + FARTHEST, replies + 3))
         for one, other in itertools.product(KINDS, KINDS)
     ]
-    if COUNT == "all" or int(COUNT) >= len(every):
-        return every
-    return random.Random(f"{program} {protocol}").sample(every, int(COUNT))
+    return every if amount >= len(every) else chance.sample(every, int(amount))
 
 
-@pytest.mark.campaign
+@campaign(ci=40, night=400, release=EVERY_PAIR)
 @pytest.mark.parametrize("protocol", MODELS)
 @pytest.mark.parametrize("program", PROGRAMS)
-def test_late_doubled_and_lost_replies_change_no_reported_value(program: Program, protocol: float) -> None:
+def test_late_doubled_and_lost_replies_change_no_reported_value(
+    program: Program, protocol: float, amount: float, chance: random.Random
+) -> None:
     right, replies = program(protocol, {})
     assert right
     assert replies
-    for first, second in pairs(program.__name__, protocol, replies):
+    for first, second in draw_pairs(replies, amount, chance):
         found, _ = program(protocol, {number: KINDS[kind] for number, kind in (first, second)})
         assert found <= right, (first, second)

@@ -1,12 +1,11 @@
 """A servo's life: each legal transition is reached by what a simulated servo does, the others are refused."""
 
 import itertools
-import os
-import random
 
 import numpy as np
 import pytest
 from msgspec.structs import replace
+from tests.kit.campaigns import campaign
 from tests.kit.line_faults import truncate_next
 from tests.kit.rigs import goals_in, make_plan, make_rig
 
@@ -290,15 +289,10 @@ def test_torque_that_was_read_before_a_servo_was_let_go_gives_it_no_goals():
     assert rig.torque() == [True, False, True]
 
 
-STORMS = int(os.environ.get("DXLRUN_LIFE_STORMS", "6"))
-
-
-@pytest.mark.campaign
+@campaign(ci=6, night=40, release=300)
 @pytest.mark.parametrize("protocol", [1.0, 2.0])
-@pytest.mark.parametrize("seed", range(STORMS))
-def test_whatever_happens_in_whatever_order_only_legal_transitions_follow(seed, protocol):
+def test_faults_in_random_order_cause_only_legal_transitions(number, protocol, chance):
     """And no goal goes to a servo whose torque was not read as on since the last doubt."""
-    chance = random.Random(seed)
     story = Story(protocol)
     rig, line = story.rig, story.rig.buses[0]
     rig.hardware.start()

@@ -1,20 +1,17 @@
 """Mode changes while the line and the servos fail: no servo ever gets a goal that another mode would follow.
 
-`DXLRUN_MODE_STORMS` is the number of seeds, 6 in CI; a storm is 8 s of a robot at 50 Hz.
+A storm is 8 s of a robot at 50 Hz; CI runs two of each robot, `pytest --campaign=release FILE` 300.
 """
-
-import os
-import random
 
 import numpy as np
 import pytest
+from tests.kit.campaigns import campaign
 from tests.kit.rigs import make_plan, random_fault, start_rig
 
 from dxlrun.channels.event_records import EventCode
 from dxlwire.modes import Mode
 from dxlwire.plan.mode_plan import in_mode
 
-STORMS = int(os.environ.get("DXLRUN_MODE_STORMS", "6"))
 FOLLOWED = {
     2.0: {100: {16}, 102: {0, 5}, 104: {1}, 112: {3, 4, 5}},
     1.0: {30: {"joint"}, 32: {"wheel"}, 71: {"torque"}},
@@ -70,12 +67,11 @@ def judge(rig, sent):
             assert mode in FOLLOWED[protocol][address], (address, servo_id, mode)
 
 
-def storm(name, seed):
-    """Let a robot change modes in a storm, judged on the way; returns it at rest again."""
+def storm(name, chance):
+    """Let a robot change modes in a storm, and judge each cycle; return the robot at rest again."""
     model, protocol, modes = ROBOTS[name]
     change = {"reference": np.pi} if protocol == 2.0 else {}
     rig = start_rig(make_plan((1, 2, 3), model=model, protocol=protocol, return_delay_ns=0, **change))
-    chance = random.Random(f"{name} {seed}")
     for cycle in range(400):
         if cycle < 250 and chance.random() < 0.08:
             wishes(rig, chance, modes)
@@ -91,11 +87,10 @@ def storm(name, seed):
     return rig
 
 
-@pytest.mark.campaign
+@campaign(ci=2, night=50, release=300)
 @pytest.mark.parametrize("name", ROBOTS)
-@pytest.mark.parametrize("seed", range(STORMS // 3))
-def test_a_servo_gets_only_goals_that_its_mode_follows_and_its_mode_is_known_in_the_end(name, seed):
-    rig = storm(name, seed)
+def test_servo_gets_only_goals_of_its_mode_which_is_known_after_the_storm(name, number, chance):
+    rig = storm(name, chance)
     out = (EventCode.SERVO_LIMP, EventCode.SERVO_LOST, EventCode.SERVO_REBOOTED)
     excused = {source for code in out for source, _ in rig.events.of(code)}
     for servo in rig.plans[0].servos:
