@@ -19,7 +19,7 @@ from typing import NamedTuple, TypeVar
 
 import pytest
 from hypothesis import settings
-from tests.kit import campaigns, selection
+from tests.kit import campaigns, selection, skips
 
 settings.register_profile("fixed", derandomize=True, print_blob=True)
 settings.register_profile("search", derandomize=False, print_blob=True, max_examples=2000)
@@ -138,12 +138,14 @@ class Extras:
 def pytest_addoption(parser: pytest.Parser) -> None:
     campaigns.add_options(parser)
     selection.add_options(parser)
+    skips.add_options(parser)
 
 
 def pytest_configure(config: pytest.Config) -> None:
     config.pluginmanager.register(Extras())
     config.pluginmanager.register(campaigns.Campaigns(config))
     config.pluginmanager.register(selection.Selection(config))
+    config.pluginmanager.register(skips.Skips(config))
     # a shell ignores Ctrl-C for what it starts in the background, and what that starts inherits it
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)

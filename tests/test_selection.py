@@ -24,12 +24,12 @@ def _run(tmp_path: Path):
     inherited = {name: value for name, value in os.environ.items() if not name.startswith(("PYTEST", "COV_"))}
     environment = inherited | {"PYTHONPATH": str(ROOT)}
 
-    def run(*words: str) -> list[str]:
+    def run(*words: str, code: int = 0) -> list[str]:
         command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *words]
         ran = subprocess.run(
             command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
         )
-        assert ran.returncode == 0, ran.stdout + ran.stderr
+        assert ran.returncode == code, ran.stdout + ran.stderr
         return ran.stdout.splitlines()
 
     return run
@@ -45,6 +45,15 @@ def test_whole_suite_leaves_out_long_tests_and_reports_it_last(run, workers: str
 @pytest.mark.parametrize("words", [("--all",), ("test_long.py", "test_short.py"), (".",)])
 def test_all_and_named_paths_run_as_a_whole(run, words: tuple[str, ...]) -> None:
     assert run("-n", "0", *words)[-1].startswith("2 passed")
+
+
+@pytest.mark.parametrize(("reason", "code"), [("moto[server,s3]", 0), ("it is Sunday", 1)])
+def test_other_skip_than_those_allowed_fails_the_run(run, tmp_path: Path, reason: str, code: int) -> None:
+    (tmp_path / "test_short.py").write_text(f"import pytest\ndef test_skip():\n    pytest.skip({reason!r})\n")
+    for workers in ("0", "2"):
+        run("-n", workers)
+        lines = run("-n", workers, "--strict-skips", code=code)
+        assert any("not allowed to skip: test_short.py::test_skip" in line for line in lines) == bool(code)
 
 
 @pytest.mark.parametrize(

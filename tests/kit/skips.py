@@ -1,0 +1,65 @@
+"""Skips: what may be skipped where all extras are installed; with `--strict-skips` others fail a run."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Generator
+
+import pytest
+
+ALLOWED = {
+    r"DXLRUN_ROS2_PYTHON": "ROS 2 has an environment of its own, which docs/how-to/ros2.md builds",
+    r"DXLRUN_BAM_RECORDINGS": "recordings of real servos, 300 MB",
+    r"/dev/uinput": "the kernel of a container makes no input devices",
+    r"no Chromium is installed": "a browser; apt install chromium",
+    r"no bundle": "the page's bundle needs npm",
+    r"no IPv6": "the network of a container",
+    r"no real time to give": "the limits of the account",
+    r"moto\[server,s3\]": "a server of S3, 200 MB",
+    r"zensical": "builds the site",
+    r"Python 3\.11|3\.11 only": "packages without wheels for newer interpreters",
+}
+"""Patterns of reasons, and why each may skip."""
+
+
+def add_options(parser: pytest.Parser) -> None:
+    """Add the option of skips to pytest."""
+    parser.addoption(
+        "--strict-skips", action="store_true", help="fail for a skip that tests/kit/skips.py does not allow"
+    )
+
+
+class Skips:
+    """Plugin: fails the run for skips that are not allowed."""
+
+    def __init__(self, config: pytest.Config) -> None:
+        self._strict: bool = config.getoption("--strict-skips")
+        self._found: list[str] = []
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        """Note a skip that is not allowed."""
+        self._note(report)
+
+    def pytest_collectreport(self, report: pytest.CollectReport) -> None:
+        """Note a module that is skipped as a whole."""
+        self._note(report)
+
+    def _note(self, report: pytest.TestReport | pytest.CollectReport) -> None:
+        if not report.skipped or hasattr(report, "wasxfail"):
+            return
+        reason = report.longrepr[2] if isinstance(report.longrepr, tuple) else str(report.longrepr)
+        if not any(re.search(pattern, reason) for pattern in ALLOWED):
+            self._found.append(f"{report.nodeid}: {reason}")
+
+    @pytest.hookimpl(wrapper=True, trylast=True)
+    def pytest_sessionfinish(self, session: pytest.Session) -> Generator[None, None, None]:
+        """Fail the run."""
+        if self._strict and self._found and not hasattr(session.config, "workerinput"):
+            session.exitstatus = session.exitstatus or pytest.ExitCode.TESTS_FAILED
+        yield
+
+    def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
+        """Name the skips that are not allowed."""
+        if self._strict:
+            for line in sorted(set(self._found)):
+                terminalreporter.write_line(f"not allowed to skip: {line}")
