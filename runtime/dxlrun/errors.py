@@ -147,6 +147,5 @@ def missing_extra(what: str, extra: str, *libraries: str) -> str:
     missing = [name for name in libraries if find_spec(name) is None]
     if not missing:
         return ""
-    are, them = ("are", "them") if missing[1:] else ("is", "it")
-    line = f"`pip install 'dxlrun[{extra}]'` installs {them}"
-    return f"{what} needs {' and '.join(missing)}, which {are} not installed; {line}"
+    names = " and ".join(missing)
+    return f"{what} needs {names} (not installed); install it: `pip install 'dxlrun[{extra}]'`"

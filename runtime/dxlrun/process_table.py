@@ -114,7 +114,7 @@ def describe_run(process: Path) -> str:
     robot = robot_of(process)
     if robot is None:
         return ""
-    return f"a run of {robot}; `dxlrun stop --robot {robot}` ends it, or Ctrl-C in its terminal"
+    return f"a run of {robot}; stop it by `dxlrun stop --robot {robot}`, or Ctrl-C in its terminal"
 
 
 def found_runs() -> list[FoundRun]:

@@ -92,10 +92,12 @@ def test_all_that_happened_to_one_servo_is_one_sentence(write: Make, cycle: Make
 
 
 def test_a_failure_beside_the_loop_is_the_runs(write: Make, cycle: Make) -> None:
-    path = write([cycle(0)], metadata={"failures": {"0": "the simulated bus ended before the run did"}})
+    path = write(
+        [cycle(0)], metadata={"failures": {"0": "the simulated bus exited before the end of the run"}}
+    )
     verdict = analyze_log(path).verdict
     assert not verdict.good
-    assert verdict.sentences[1] == "The run failed: the simulated bus ended before the run did."
+    assert verdict.sentences[1] == "The run failed: the simulated bus exited before the end of the run."
 
 
 @pytest.mark.parametrize(("skipped", "good"), [(0, True), (100, True), (101, False)])

@@ -13,7 +13,8 @@ from tests.kit.held_logs import being_written, cut_end
 
 ROBOT = Path(__file__).parents[2] / "robots" / "single_joint.yaml"
 """Of one joint, because a page has a figure for each."""
-NO_LOG = "this is not an MCAP file, and a log of dxlrun is one"
+SHORT = "this is not an MCAP file"
+NO_LOG = f"{SHORT}; give a log of dxlrun"
 
 
 @pytest.fixture
@@ -45,7 +46,7 @@ def test_a_report_is_written_beside_the_output(dxlrun: Callable, log: Path, tmp_
 
 @pytest.mark.parametrize(
     ("name", "sentence"),
-    [("run.mcap", "its name ends in .html"), ("missing/report.html", "there is no directory")],
+    [("run.mcap", "is not a name for a report"), ("missing/report.html", "not found")],
 )
 def test_a_report_never_goes_where_it_does_harm(dxlrun: Callable, tmp_path: Path, name: str, sentence: str):
     log = tmp_path / "run.mcap"
@@ -71,7 +72,7 @@ def test_without_bokeh_one_sentence_has_the_command_that_installs_it(
 
     assert said.code == 2
     assert said.errors == [
-        "dxlrun: a report needs bokeh, which is not installed; `pip install 'dxlrun[report]'` installs it"
+        "dxlrun: a report needs bokeh (not installed); install it: `pip install 'dxlrun[report]'`"
     ]
 
 
@@ -114,10 +115,10 @@ def test_a_log_that_is_being_written_is_called_so(dxlrun: Callable, log: Path):
         report = result_of(dxlrun("analyze", log, "--json").out)
         assert ": being written; so far: " in dxlrun("analyze", log, log).out
     assert (said.code, report["being_written"], report["complete"]) == (1, True, False)
-    assert "has no end yet: a run is writing it; its last cycle is at " in said.out
+    assert "is still being written by a run; its last cycle is at " in said.out
     assert "no, a run is writing it" in said.out
     ended = dxlrun("analyze", log)
-    assert "its recorder was killed, or could write no more; its last cycle is at " in ended.out
+    assert "the recorder was killed or could not write; its last cycle is at " in ended.out
 
 
 def test_without_a_log_in_the_directory_one_sentence_names_the_directory(
@@ -148,7 +149,7 @@ def test_several_logs_get_one_line_each(dxlrun: Callable, log: Path, tmp_path: P
     assert said.errors == [f"dxlrun: {other}: {NO_LOG}"]
     answer = read_answer(dxlrun("analyze", first, other, second, "--json").out)
     assert [each["log"] for each in answer.result["logs"]] == [str(first), str(second)]
-    assert [error.what for error in answer.errors] == [f"{other}: {NO_LOG}"]
+    assert [error.what for error in answer.errors] == [f"{other}: {SHORT}"]
 
 
 @pytest.mark.parametrize(("option", "value"), [("--report", "file.html"), ("--worst", "3")])

@@ -25,6 +25,7 @@ def test_demo_plays_its_motion_in_an_empty_directory(
     monkeypatch.chdir(tmp_path)
     ran = dxlrun("demo", "--virtual")
     assert (ran.code, "bioloid_torso: done: ran for 35.0 s; 3 of 3 goals reached" in ran.out) == (0, True)
+    assert "warning" not in ran.err
     assert len([*(tmp_path / "logs").glob("bioloid_torso_*.mcap")]) == 1
 
 
@@ -63,7 +64,7 @@ def test_page_is_served_during_the_run_where_it_is_installed(
         return 7
 
     monkeypatch.setattr(subprocess, "Popen", start)
-    monkeypatch.setattr(run_room, "run", run)
+    monkeypatch.setattr(run_room, "_run_plan", run)
     monkeypatch.setattr(verb_registry, "packaged", lambda: {"view": object()})
     monkeypatch.setattr(sockets, "running", lambda: ("other",))
     assert run_room.demo(**options) == 7
@@ -74,7 +75,7 @@ def test_page_is_served_during_the_run_where_it_is_installed(
 def test_demo_without_the_page_names_the_package(
     dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(run_room, "run", lambda *_, **__: 0)
+    monkeypatch.setattr(run_room, "_run_plan", lambda *_, **__: 0)
     monkeypatch.setattr(verb_registry, "packaged", dict)
     assert run_room.demo() == 0
     assert "install dxlrun-view" in capsys.readouterr().out

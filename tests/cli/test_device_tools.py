@@ -85,7 +85,7 @@ joints: {neck: {bus: main, id: 1, model: XL430-W250, reference: 180 deg, directi
 WRONG = (
     (
         (42, "reboot"),
-        "bitbots-core, ID 42 at 1000000 bit/s is not a servo, so it cannot reboot; it has get",
+        "bitbots-core, ID 42 at 1000000 bit/s is not a servo and cannot reboot; use get",
     ),
     ((42, "set", "vdxl", 3), "Vdxl (32) can only be read"),
     ((42, "set", "led", 2), "LED (22) of an bitbots-core is 0..1, not 2"),

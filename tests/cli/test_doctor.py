@@ -129,7 +129,7 @@ def test_rates_that_a_driver_does_not_have_are_named(look: Look) -> None:
     one = look(set_rates=sets)["baud rates of /dev/ttyUSB0"]
     assert (one.state, one.found) == (
         "worse",
-        "its driver does not have all rates: 4000000 becomes 3000000 bit/s",
+        "its driver changes rates: 4000000 becomes 3000000 bit/s",
     )
     assert one.fix == "choose a rate of: 57600, 1000000"
     good = look(set_rates=lambda path: {1_000_000: 1_000_000})["baud rates of /dev/ttyUSB0"]
@@ -205,9 +205,7 @@ def test_the_preemption_of_the_kernel_is_found(
 def test_the_configuration_of_the_running_kernel_may_be_compressed(look: Look, tmp_path: Path) -> None:
     (tmp_path / "proc").mkdir()
     (tmp_path / "proc/config.gz").write_bytes(gzip.compress(NONE.encode()))
-    assert look(DYNAMIC)["preemption"].fix == (
-        "add preempt=full to the kernel's command line and start it again"
-    )
+    assert look(DYNAMIC)["preemption"].fix == ("add preempt=full to the kernel's command line and reboot")
     (tmp_path / "proc/config.gz").write_bytes(b"\x1f\x8b")
     assert "preemption" not in look(DYNAMIC)
 
@@ -219,7 +217,7 @@ def test_the_configuration_of_the_running_kernel_may_be_compressed(look: Look, t
             {"sys/bus/usb-serial/devices/ttyUSB0/latency_timer": "16"},
             {},
             "latency timer of ttyUSB0",
-            "16 ms where 1 ms is possible",
+            "16 ms, 1 ms is possible",
             "echo 1 | sudo tee /sys/bus/usb-serial/devices/ttyUSB0/latency_timer",
         ),
         (
@@ -232,12 +230,12 @@ def test_the_configuration_of_the_running_kernel_may_be_compressed(look: Look, t
         ({}, {"highest_priority": 0}, "real-time priority", "none is allowed", LIMITS),
         ({}, {"highest_priority": 20}, "real-time priority", "up to 20, a run needs 32", "rtprio 98"),
         ({".dockerenv": ""}, {"highest_priority": 0}, "real-time priority", "none is allowed", CONTAINER),
-        ({}, {"may_schedule": lambda: False}, "real-time priority", "the kernel refuses it", "sysctl"),
+        ({}, {"may_schedule": lambda: False}, "real-time priority", "refused by the kernel", "sysctl"),
         (
             {"run/.containerenv": ""},
             {"may_schedule": lambda: False},
             "real-time priority",
-            "the kernel refuses it",
+            "refused by the kernel",
             CONTAINER,
         ),
         ({}, {"lockable": 8 << 20}, "locked memory", "only 8192 KiB may be locked", "memlock unlimited"),
@@ -284,15 +282,15 @@ def test_the_configuration_of_the_running_kernel_may_be_compressed(look: Look, t
             {"sys/devices/system/clocksource/clocksource0/current_clocksource": "hpet"},
             {},
             "clock",
-            "the clock source is hpet, which is slow to read",
+            "the clock source is hpet, slow to read",
             "clocksource=tsc",
         ),
-        ({}, {"cores": 1}, "cores", "there is one core for all processes", "two cores"),
+        ({}, {"cores": 1}, "cores", "one core for all processes", "two cores"),
         (
             {"sys/devices/system/cpu/cpu1/cpufreq/scaling_governor": "powersave"},
             {},
             "CPU governor",
-            "performance, powersave where performance is meant",
+            "performance, powersave instead of performance",
             "echo performance | sudo tee /sys/devices/system/cpu/cpu*/cpufreq/scaling_governor",
         ),
         (
@@ -388,7 +386,7 @@ def test_isolated_cores_are_offered_to_the_loop(look: Look) -> None:
     [
         ({"platform": "darwin"}, "this is darwin; robots run on Linux only"),
         ({"platform": "win32"}, "this is win32; robots run on Linux only"),
-        ({"missing_calls": ("pidfd_open",)}, "this Python has no pidfd_open"),
+        ({"missing_calls": ("pidfd_open",)}, "this Python lacks pidfd_open"),
     ],
 )
 def test_another_system_is_reported_in_one_sentence(look: Look, other: dict[str, Any], found: str) -> None:

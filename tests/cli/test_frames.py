@@ -40,7 +40,7 @@ pair: 4 frames, 2 of them move; 30 Hz in the log
 base
 └── head      pan: revolute, axis 0 0 1, ID 1 on bus main
     ├── chin  chin: revolute, axis 1 0 0, -2 x pan +0.5
-    └┄┄ jaw   jaw: prismatic, axis 1 0 0, no servo moves it: stays at 0.02
+    └┄┄ jaw   jaw: prismatic, axis 1 0 0, without a servo: stays at 0.02
 """
 
 
@@ -100,7 +100,7 @@ def test_python_gets_the_same_pose(pair: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        (["--at", "pan=1rad"], "--at and --relative-to are for one frame; name it by --of"),
+        (["--at", "pan=1rad"], "--at and --relative-to need a frame; name it by --of"),
         (["--of", "jam"], "frame jam not found; did you mean jaw?"),
         (["--of", "jaw", "--at", "pan"], "'pan' is not key=value; write for example --at elbow=30deg"),
         (["--of", "jaw", "--at", "pan=1"], "--at pan=1: '1' has no unit; write an angle with its unit"),
@@ -128,8 +128,8 @@ def test_a_robot_without_a_urdf_has_no_frames(dxlrun: Dxlrun, pair: Path) -> Non
     done = dxlrun("frames", str(pair))
 
     assert done.code == 2
-    assert "names no URDF, so there are no frames; write `model: {urdf: NAME.urdf}`" in done.err
-    with pytest.raises(InputError, match="names no URDF"):
+    assert "has no URDF and so no frames; write `model: {urdf: NAME.urdf}`" in done.err
+    with pytest.raises(InputError, match="has no URDF"):
         kinematics(pair)
 
 

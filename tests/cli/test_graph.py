@@ -132,8 +132,8 @@ def test_what_cannot_be_a_picture_is_refused_in_one_sentence(
 ) -> None:
     for words, what in (
         ((tmp_path / "graph.png",), "the file's suffix must be .svg or .dot"),
-        (("port:=sim",), "without a file --graph is the last word"),
-        ((tmp_path / "gone" / "graph.svg",), "cannot be written (there is no directory"),
+        (("port:=sim",), "to draw in the terminal, write --graph last"),
+        ((tmp_path / "gone" / "graph.svg",), "cannot be written (directory"),
     ):
         said = dxlrun("check", chain, "--graph", *words)
         assert said.code == 2

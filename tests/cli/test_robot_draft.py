@@ -114,7 +114,7 @@ def test_the_first_send_to_a_drafted_robot_moves_it_slowly(tmp_path, protocol, m
         path, PORT, [found(1, model, protocol, baud_rate), found(2, model, protocol, baud_rate)], 0
     )
     assert text.count(f"velocity: {slow} deg/s") == 2
-    assert "raise its limits.velocity" in text
+    assert "limits.velocity after" in text
     robot = simulated_robot(path, arguments={"port": "sim"}, duration_s=5.0)
     robot.inbox.waiting.append(
         CommandMessage(1, "all_joints", "positions", array("d", (1.0, -1.0)).tobytes(), "anna")

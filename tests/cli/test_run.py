@@ -171,8 +171,8 @@ def test_wait_for_simulated_servos_names_the_machine(dxlrun: Callable, runs: Run
     runs.answer = RunSummary(0, "ended", 100, 3, 2.0, (), simulation_wait=wait)
 
     assert dxlrun(torso).out.splitlines()[1] == (
-        "  The machine was too busy: the loop waited 3 times, 210 ms in all, because the process of the "
-        "simulated servos did not run. End other programs, or use --virtual."
+        "  The machine was too busy: the loop waited 3 times, 210 ms in all, for the process of the "
+        "simulated servos. End other programs, or use --virtual."
     )
 
 
@@ -273,7 +273,7 @@ FAULT = EventGroup(EventCode.CONTROLLER_FAULT, Severity.ERROR, "head", 1, 5_100_
         (
             {"events": EventTotals((TAKEOVER,), started_ns=5_000_000_000)},
             0,
-            "at 0.1 s reflex had others take over: it falls; ran for 2.0 s.",
+            "at 0.1 s reflex triggered a takeover: it falls; ran for 2.0 s.",
             "0 of 100 periods skipped.",
         ),
         ({"events": EventTotals((FAULT,))}, 1, "ran for 2.0 s.", "head: head: nan."),
@@ -459,7 +459,7 @@ def full_disk(log: Path) -> None:
 @pytest.mark.parametrize(
     ("harm", "said_of_it"),
     [
-        (Path.unlink, "its file was deleted or moved by another program during the run"),
+        (Path.unlink, "another program deleted or moved the file during the run"),
         (full_disk, "writing the log stopped: File too large"),
     ],
 )

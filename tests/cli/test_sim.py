@@ -244,7 +244,7 @@ def test_a_simulation_whose_process_dies_fails_with_a_sentence(start, tmp_path):
     code, _, err = sim.end()
 
     assert code == 1
-    assert "simulation: the simulated bus ended in the middle" in err
+    assert "simulation: the simulated bus exited unexpectedly" in err
 
 
 def test_a_ledger_that_is_not_complete_fails_at_the_end(start):

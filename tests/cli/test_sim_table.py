@@ -76,7 +76,7 @@ def test_a_low_window_keeps_the_prompt():
     lines = drawn(look(40), "lose", height=12)
 
     assert len(lines) < 12
-    assert "... and 35 more; a higher window shows them" in lines
+    assert "... and 35 more; enlarge the window to see them" in lines
     assert lines[-1].startswith("fault> lose")
 
 

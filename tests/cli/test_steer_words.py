@@ -14,7 +14,7 @@ from dxlrun.cli.steering.written import WrittenEntry
 from dxlrun.errors import InputError, Refused
 from dxlrun.output.terminal import show_parts
 
-NO_ROBOT = "dxlrun: no robot runs that can be steered; `dxlrun ROBOT.yaml` starts one"
+NO_ROBOT = "dxlrun: no running robot found; start one by `dxlrun ROBOT.yaml`"
 
 
 @pytest.fixture

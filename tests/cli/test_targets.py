@@ -104,7 +104,7 @@ def test_a_report_is_replaced_by_a_report(here: Path) -> None:
         write_report(Path("report.html"), text)
         assert (here / "report.html").read_text() == text
     (here / "report.html").write_text("<p>by hand</p>")
-    with pytest.raises(InputError, match="is not from dxlrun"):
+    with pytest.raises(InputError, match="was not written by dxlrun"):
         check_report(Path("report.html"), "json")
 
 
@@ -115,14 +115,14 @@ def test_an_older_file_of_the_same_kind_is_replaced_where_a_link_leads(here: Pat
     write_target(Path("link"), f"a newer one, {MARK}", MARK)
     assert (here / "real").read_text() == f"a newer one, {MARK}"
     assert ((here / "link").is_symlink(), (here / "real").stat().st_mode & 0o777) == (True, 0o600)
-    with pytest.raises(InputError, match="it exists, and is not from dxlrun"):
+    with pytest.raises(InputError, match="it exists and was not written by dxlrun"):
         write_target(Path("link"), "", "drawn by others")
 
 
 @pytest.mark.parametrize(
     ("target", "reason"),
     [
-        ("missing/a", "there is no directory missing"),
+        ("missing/a", "directory missing not found"),
         ("text/a", "Not a directory"),
         ("text", "it exists"),
         (".", "it exists and is a directory"),

@@ -49,7 +49,7 @@ def orphan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Begin]:
 def test_a_loop_without_the_rest_of_its_run_is_named_and_ended(dxlrun, orphan: Begin) -> None:
     loop = orphan("lonely_arm")
     problem = "it has no supervisor and no guardian and no gateway"
-    fix = "`dxlrun stop --robot lonely_arm` ends it"
+    fix = "end it by `dxlrun stop --robot lonely_arm`"
     named = f"dxlrun: lonely_arm runs but cannot be steered: {problem}; {fix}\n"
     assert dxlrun("list") == (0, "", named)
     assert dxlrun("list", "--robot", "lonely_arm") == (1, "", named)
@@ -58,7 +58,7 @@ def test_a_loop_without_the_rest_of_its_run_is_named_and_ended(dxlrun, orphan: B
     ended = f"lonely_arm has ended; it could not be steered: {problem}\n"
     assert dxlrun("stop") == (0, ended, "")
     assert loop.wait(DEADLINE_S) == 0
-    assert "no robot runs" in dxlrun("list").out
+    assert "no running robot found" in dxlrun("list").out
 
 
 SUPERVISOR = """\
@@ -78,12 +78,12 @@ while True:
 @pytest.mark.parametrize(
     ("phase", "steering", "said"),
     [
-        (Phase.LOADING, GatewayAvailability.IMPOSSIBLE, "is starting and cannot be steered yet"),
-        (Phase.RUNNING, GatewayAvailability.AWAITED, "is starting and cannot be steered yet"),
+        (Phase.LOADING, GatewayAvailability.IMPOSSIBLE, "is starting; try again when it runs"),
+        (Phase.RUNNING, GatewayAvailability.AWAITED, "is starting; try again when it runs"),
         (
             Phase.RUNNING,
             GatewayAvailability.IMPOSSIBLE,
-            "runs but cannot be steered: it has no gateway; `dxlrun stop",
+            "runs but cannot be steered: it has no gateway; end it by `dxlrun stop",
         ),
         (Phase.DONE, GatewayAvailability.POSSIBLE, "is ending"),
     ],
@@ -161,7 +161,7 @@ def test_a_run_of_another_runtime_directory_is_ended_by_name_only(
     other = tmp_path / "other"
     other.mkdir()
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(other))
-    assert "no robot runs that can be steered" in dxlrun("stop").err
+    assert "no running robot found" in dxlrun("stop").err
     assert "far_arm" not in dxlrun("list").err
     assert dxlrun("stop", "--robot", "far_arm").code == 0
     assert loop.wait(DEADLINE_S) == 0

@@ -155,7 +155,6 @@ def test_a_verb_whose_package_is_absent_names_the_line_that_installs_it(
     said = dxlrun(verb, "run.mcap")
     assert said.code == 2
     assert said.errors == [
-        f"dxlrun: `dxlrun {verb}` is a command of the package {package}, which cannot be imported "
-        f"here; `dxlrun plugins` may say why, and `pip install {place}` in the source folder of dxlrun "
-        "installs it"
+        f"dxlrun: `dxlrun {verb}` needs the package {package}, and its import failed; "
+        f"install it in the source folder of dxlrun: `pip install {place}`"
     ]

@@ -201,6 +201,13 @@ def test_an_interrupt_is_its_end(shown: Any, monkeypatch: pytest.MonkeyPatch) ->
 def test_the_newest_event_stands_last() -> None:
     watched = watch.WatchedRobot(Robot())  # type: ignore[arg-type]  # a stand-in
     watched.poll_robot()
-    watched.events = [{"time": at, "severity": 20, "source": "loop", "text": str(at)} for at in (1.0, 2.0)]
+    event = {"severity": 20, "source": "loop", "name": "steered"}
+    texts = {
+        1.0: "1.0",
+        2.0: "2.0",
+        3.0: "pause from loop",
+        4.0: "resume from loop",
+    }  # the last: of each start
+    watched.events = [{**event, "time": at, "text": text} for at, text in texts.items()]
     assert watch.event_lines(watched, 0) == []
     assert watch.event_lines(watched, 1) == [Sentence(" 99.0 s ago, loop: 2.0", "plain")]

@@ -75,7 +75,7 @@ def test_a_free_joint_is_switched_and_answered_when_it_is_done(story):
     story.run(6, {1: story.torques("j2"), 2: look, 3: story.done(), 4: look})
     assert story.what == [(2, False)]
     assert answers == [Acceptance(()), Completion(2)]
-    assert story.events.texts(EventCode.STEERED) == ['torque {"joints":["j2"],"on":false} from anna']
+    assert story.events.texts(EventCode.STEERED) == ["torque off: j2 from anna"]
 
 
 def test_a_joint_that_is_commanded_is_refused_without_release(story):
@@ -203,9 +203,9 @@ def test_a_register_is_answered_when_the_servo_has_it_and_not_before(story):
     assert answers == [{}]
     assert story.what == [(1, "p_gain", 40), (1, "p_gain")]
     assert [story.answer(number) for number in (1, 2)] == [Completion(3, value=32), Completion(3, value=40)]
-    text = 'register {"joint":"j1","item":"p_gain","value":40}'
-    assert story.events.texts(EventCode.STEERED)[0] == f"{text} from anna"
-    assert (story.taken[0].cycle, story.taken[0].data_text) == (1, text.removeprefix("register "))
+    assert story.events.texts(EventCode.STEERED)[0] == "register p_gain of j1 = 40 from anna"
+    text = '{"joint":"j1","item":"p_gain","value":40}'
+    assert (story.taken[0].cycle, story.taken[0].data_text) == (1, text)
 
 
 @pytest.mark.parametrize(

@@ -97,10 +97,10 @@ def test_publishing_nothing_marks_the_cycle():
     ("topic", "message", "reason"),
     [
         ("states", state(), r"published on states, but its Topics are state, other"),
-        ("state", {"a": 1}, "published an invalid message: topic state takes State, not dict"),
-        ("state", None, "topic state takes State, not NoneType"),
-        ("state", State(Header(), [1.0]), "takes no such State.error: numbers come as an array"),  # type: ignore[arg-type]
-        ("state", state(text="x" * LONGEST_MESSAGE), f"takes {LONGEST_MESSAGE} bytes at most, not 65"),
+        ("state", {"a": 1}, "published an invalid message on topic state: dict given, State expected"),
+        ("state", None, "NoneType given, State expected"),
+        ("state", State(Header(), [1.0]), "State.error: list given, an array of float64 expected"),  # type: ignore[arg-type]
+        ("state", state(text="x" * LONGEST_MESSAGE), f" bytes, more than {LONGEST_MESSAGE}"),
     ],
 )
 def test_what_a_topic_does_not_take_is_a_fault_and_reaches_nothing(topic, message, reason):

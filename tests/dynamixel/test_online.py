@@ -132,7 +132,7 @@ def test_a_servo_that_is_missing_is_in_the_log_too(check, tmp_path):
 
 def test_a_log_without_online_is_refused(tmp_path, capsys):
     assert main(["check", "robot.yaml", "--log", str(tmp_path / "x.mcap")]) == 2
-    assert "--log keeps what --online sends and receives; give --online too" in capsys.readouterr().err
+    assert "--log records the packets of --online; add --online" in capsys.readouterr().err
 
 
 def test_settings_that_another_program_left_are_a_table_with_what_they_do(check):

@@ -245,7 +245,7 @@ def test_the_run_that_has_the_line_is_named_and_how_to_end_it(terminal):
         with pytest.raises(PortError) as refused:
             dxlrun.open_serial(path, 1_000_000)
     assert str(refused.value) == (
-        f"{path} is in use by a run of pan_tilt; `dxlrun stop --robot pan_tilt` ends it, or Ctrl-C in its "
+        f"{path} is in use by a run of pan_tilt; stop it by `dxlrun stop --robot pan_tilt`, or Ctrl-C in its "
         f"terminal; {help_link('the-port-is-in-use')}"
     )
 

@@ -9,7 +9,6 @@ behind a silent one lose their replies with it.
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
@@ -192,7 +191,7 @@ def silent_at(events: Sequence[Event], t_ns: int) -> set[str]:
     for event in sorted(events, key=lambda event: event.t_ns):
         if event.t_ns <= t_ns and event.code == EventCode.STEERED and event.text.startswith("reboot "):
             request = event.text.removeprefix("reboot ").rpartition(" from ")[0]
-            silent.update(json.loads(request)["joints"])
+            silent.update(request.split(", "))
         if event.t_ns <= t_ns and event.code in SILENT:
             silent.add(event.source)
         elif event.t_ns <= t_ns and event.code in HEARD:

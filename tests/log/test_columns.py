@@ -262,9 +262,9 @@ def test_a_foreign_file_has_columns_and_no_slices(foreign: Path) -> None:
     assert [row.tolist() for row in found["position"][:4]] == [[0.0], [0.5, 0.5], [1.0], [1.5, 1.5]]
     assert found["effort"].shape == (500, 1)
     assert reader.damage == ()
-    with pytest.raises(LogError, match="not written by dxlrun"):
+    with pytest.raises(LogError, match="is not a log of dxlrun"):
         next(reader.slices())
-    with pytest.raises(LogError, match="not written by dxlrun"):
+    with pytest.raises(LogError, match="is not a log of dxlrun"):
         read_log(foreign)
 
 
@@ -291,9 +291,9 @@ def test_what_is_not_there_is_named(path: Path) -> None:
         (
             "json",
             "jsonschema",
-            "messages of /x are json, defined in jsonschema; only cdr with ros2msg is read",
+            "messages of /x are json with schema jsonschema; dxlrun reads only cdr with ros2msg",
         ),
-        ("cdr", "ros2idl", "messages of /x are cdr, defined in ros2idl"),
+        ("cdr", "ros2idl", "messages of /x are cdr with schema ros2idl"),
         ("cdr", "ros2msg", "messages of /x cannot be read: a/msg/X: not CDR, little-endian"),
     ],
 )

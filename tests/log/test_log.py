@@ -187,7 +187,7 @@ def test_a_gap_is_an_event_and_counted(log: LogWriter, tmp_path: Path, cycle: Cy
     [
         (b"", "the file is empty"),
         (b"name: torso\n", "not an MCAP file"),
-        (b"\x89MCAP0\r\n", "not written by dxlrun"),
+        (b"\x89MCAP0\r\n", "is not a log of dxlrun"),
     ],
 )
 def test_what_is_no_log_is_refused_with_a_sentence(tmp_path: Path, content: bytes, sentence: str) -> None:
@@ -200,7 +200,7 @@ def test_what_is_no_log_is_refused_with_a_sentence(tmp_path: Path, content: byte
 def test_a_missing_log_and_a_directory_are_refused(tmp_path: Path) -> None:
     with pytest.raises(LogError, match="No such file"):
         read_log(tmp_path / "none.mcap")
-    with pytest.raises(LogError, match="a directory without a log"):
+    with pytest.raises(LogError, match="the directory has no log"):
         read_log(tmp_path)
 
 
@@ -226,9 +226,9 @@ OTHER_FORMAT = "and this version reads formats 8 and 9 only; use the version of 
         ({"format": "7"}, f"it has log format 7, {OTHER_FORMAT}"),
         ({"format": "99"}, f"it has log format 99, {OTHER_FORMAT}"),
         ({"format": None}, f"it has log format none, {OTHER_FORMAT}"),
-        ({"joints": "{"}, "cannot read: the metadata .* is missing or wrong"),
-        ({"joints": "[1]"}, "cannot read: the metadata .* is missing or wrong"),
-        ({"joints": None}, "cannot read: the metadata 'joints' is missing or wrong"),
+        ({"joints": "{"}, "cannot read the log: the metadata .* is missing or wrong"),
+        ({"joints": "[1]"}, "cannot read the log: the metadata .* is missing or wrong"),
+        ({"joints": None}, "cannot read the log: the metadata 'joints' is missing or wrong"),
     ],
     ids=str,
 )
@@ -318,9 +318,7 @@ def test_a_chunk_that_is_longer_than_its_header_has_it_is_not_decompressed_furth
         tracemalloc.stop()
 
     assert log.cycles["cycle"].tolist() == [0, 1, 3]
-    assert log.damage == (
-        "a chunk of messages is damaged and skipped: it has another length than it declares",
-    )
+    assert log.damage == ("a chunk of messages is damaged and skipped: it has the wrong length",)
     assert most < 10 << 20
 
 
@@ -384,7 +382,7 @@ def test_a_mode_that_is_none_is_reported(
     record["mode"][0, 1] = 77
     log.write_record(RecordKind.CYCLE, record.tobytes())
     log.close()
-    with pytest.raises(LogError, match="cycle 7 has a mode of a servo that is not known"):
+    with pytest.raises(LogError, match="cycle 7 has an unknown mode of a servo"):
         read_log(tmp_path / "run.mcap")
 
 
@@ -447,7 +445,7 @@ def test_a_file_that_is_gone_is_reported(log: LogWriter, tmp_path: Path, cycle: 
         elsewhere.unlink()
     if what == "replaced":
         path.write_bytes(b"another")
-    assert log.close().error == "its file was deleted or moved by another program during the run"
+    assert log.close().error == "another program deleted or moved the file during the run"
 
 
 def test_a_file_that_was_cut_is_reported_and_gets_no_hole(
@@ -458,7 +456,7 @@ def test_a_file_that_was_cut_is_reported_and_gets_no_hole(
     log.finish_chunk()
     os.truncate(path, 100)
     log.write_record(RecordKind.CYCLE, cycle(1))
-    assert log.close().error == "writing the log stopped: the file was cut by another program"
+    assert log.close().error == "writing the log stopped: another program truncated the file"
     assert path.stat().st_size == 100
 
 

@@ -169,21 +169,21 @@ def test_nested_numbers_lie_where_rosbags_expects_them_behind_texts_of_any_lengt
 @pytest.mark.parametrize(
     ("field", "value", "reason"),
     [
-        ("amount", "much", "takes no such Everything.amount: required argument is not a float"),
-        ("count", 1.5, "takes no such Everything.count: required argument is not an integer"),
-        ("count", 1 << 63, "takes no such Everything.count"),
-        ("level", 256, "takes no such Everything.level: ubyte format requires 0 <= number <= 255"),
-        ("text", b"bytes", "takes no such Everything.text: bytes is given where text is asked"),
-        ("rows", np.zeros((2, 2)), r"rows: an array of shape \(2, 2\) is given where one row is asked"),
-        ("rows", np.zeros(2, np.float32), "rows: float32 is given where float64 is asked"),
-        ("rows", [1.0], "rows: numbers come as an array of float64, not as list"),
-        ("names", ("a", 3), "names: int is given where text is asked"),
-        ("numbers", np.zeros(2), "numbers: ndarray is given where a tuple is asked"),
+        ("amount", "much", "Everything.amount: required argument is not a float"),
+        ("count", 1.5, "Everything.count: required argument is not an integer"),
+        ("count", 1 << 63, "Everything.count"),
+        ("level", 256, "Everything.level: ubyte format requires 0 <= number <= 255"),
+        ("text", b"bytes", "Everything.text: bytes given, text expected"),
+        ("rows", np.zeros((2, 2)), r"rows: an array of shape \(2, 2\) given, one row expected"),
+        ("rows", np.zeros(2, np.float32), "rows: float32 given, float64 expected"),
+        ("rows", [1.0], "rows: list given, an array of float64 expected"),
+        ("names", ("a", 3), "names: int given, text expected"),
+        ("numbers", np.zeros(2), "numbers: ndarray given, a tuple expected"),
         ("numbers", ("a",), "numbers: could not convert string to float"),
-        ("square", np.zeros(3), "square: 3 numbers are given where 4 are asked"),
-        ("part", None, "part: NoneType is given where Part is asked"),
-        ("parts", (Part("x", 0.0), 4), "parts: int is given where Part is asked"),
-        ("header", Time(), "header: Time is given where Header is asked"),
+        ("square", np.zeros(3), "square: 3 numbers given, 4 expected"),
+        ("part", None, "part: NoneType given, Part expected"),
+        ("parts", (Part("x", 0.0), 4), "parts: int given, Part expected"),
+        ("header", Time(), "header: Time given, Header expected"),
     ],
 )
 def test_a_value_that_does_not_fit_is_named_with_its_field(field: str, value: object, reason: str) -> None:
@@ -193,7 +193,7 @@ def test_a_value_that_does_not_fit_is_named_with_its_field(field: str, value: ob
 
 
 def test_a_message_of_another_class_is_refused() -> None:
-    with pytest.raises(WrongMessage, match="takes Part, not dict"):
+    with pytest.raises(WrongMessage, match="dict given, Part expected"):
         declared_message(Part, "mine").pack({"name": "x", "ratio": 0.1}, (0, 0))
 
 
@@ -238,11 +238,11 @@ class Odd:
         (made(amount=Annotated[float, Number("uint8")]), "Made.amount is .*, and ROS 2"),
         (made(amount=Annotated[int, Number("number")]), "Made.amount is .*, and ROS 2"),
         (made(amount=Annotated[str, Length(3)]), "Made.amount is .*, and ROS 2"),
-        (made(amountLeft=float), "Made.amountLeft is not a name of a field"),
-        (made(left__amount=float), "Made.left__amount is not a name of a field"),
+        (made(amountLeft=float), "Made.amountLeft is not a valid name of a field"),
+        (made(left__amount=float), "Made.left__amount is not a valid name of a field"),
         (Lazy, "the annotations of Lazy cannot be read .*Fraction"),
         (Endless, "Endless contains itself"),
-        (lower, "lower is not a name of a message"),
+        (lower, "lower is not a valid name of a message"),
         (Odd, "Odd.ros_type is 'Odd'"),
     ],
 )
@@ -254,7 +254,7 @@ def test_what_ros_has_no_message_for_is_refused(kind: object, reason: str) -> No
 
 def test_two_classes_of_one_name_are_refused() -> None:
     other = dataclasses.make_dataclass("Part", [("ratio", float)])
-    with pytest.raises(WrongMessage, match="two classes are the message mine/msg/Part"):
+    with pytest.raises(WrongMessage, match="two classes have the message name mine/msg/Part"):
         declared_message(made(one=Part, two=other), "mine")
 
 

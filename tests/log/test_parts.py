@@ -262,7 +262,7 @@ def test_a_directory_without_a_part_is_one_sentence(inside: str, tmp_path: Path)
     (tmp_path / "run").mkdir()
     if inside == "other files":
         (tmp_path / "run/other.mcap").write_text("")
-    with pytest.raises(LogError, match="a directory without a log: it has no part_0000"):
+    with pytest.raises(LogError, match=r"the directory has no log \(part_0000"):
         read_log(tmp_path / "run")
 
 
@@ -271,8 +271,8 @@ def test_a_pipe_or_a_device_is_one_sentence_and_none_of_the_parts(four: Path, tm
     (tmp_path / "zero.mcap").symlink_to("/dev/zero")
     (tmp_path / "self.mcap").symlink_to("self.mcap")
     for name, sentence in (
-        ("pipe.mcap", "a pipe or a device, not a file"),
-        ("zero.mcap", "a pipe or a device, not a file"),
+        ("pipe.mcap", "this is a pipe or a device"),
+        ("zero.mcap", "this is a pipe or a device"),
         ("self.mcap", "cannot be read: "),
     ):
         with pytest.raises(LogError, match=rf"{name}: {sentence}"):
@@ -286,8 +286,8 @@ def test_an_empty_part_or_one_that_is_no_log_is_damage_and_the_others_are_read(f
     (four / "part_0002.mcap").write_bytes(b"no log at all")
     log = read_log(four)
     assert log.damage == (
-        "part_0001.mcap: the file is empty; its recorder never began to write",
-        "part_0002.mcap: this is not an MCAP file, and a log of dxlrun is one",
+        "part_0001.mcap: the file is empty: the recorder wrote nothing",
+        "part_0002.mcap: this is not an MCAP file; give a log of dxlrun",
     )
     assert len(log.cycles) > 60
 
@@ -297,7 +297,7 @@ def test_a_part_of_another_run_is_left_out(four: Path, tmp_path: Path, header: L
     other.close()
     shutil.copy(tmp_path / "other.mcap", four / "part_0002.mcap")
     log = read_log(four)
-    assert log.damage == ("part_0002.mcap is of another run and was skipped",)
+    assert log.damage == ("part_0002.mcap belongs to another run and was skipped",)
     assert log.header.robot == "torso"
 
 
@@ -305,7 +305,7 @@ def test_a_part_that_was_cut_is_read_as_far_as_it_goes(four: Path) -> None:
     part = four / "part_0001.mcap"
     part.write_bytes(part.read_bytes()[:-200])
     log = read_log(four)
-    assert log.damage == ("part_0001.mcap has no end: its recorder was killed, or could write no more",)
+    assert log.damage == ("part_0001.mcap ends early: the recorder was killed or could not write",)
     assert numbers(log)[-1] == 174
 
 

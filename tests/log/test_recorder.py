@@ -257,7 +257,7 @@ def test_after_a_kill_the_log_is_readable_up_to_the_last_flush(start: Start, cyc
     assert not log.complete
     assert not log.being_written
     last = CycleSpan(int(log.cycles["scheduled_ns"][0]), int(log.cycles["written_ns"][-1])).last_cycle_text
-    assert log.damage == (f"the file has no end: its recorder was killed, or could write no more; {last}",)
+    assert log.damage == (f"the file ends early: the recorder was killed or could not write; {last}",)
     assert CycleSpan.load(recording.span).last_cycle_text == last
     assert log.cycles.tobytes() == b"".join(cycle(number) for number in range(20))
 

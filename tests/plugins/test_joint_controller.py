@@ -220,11 +220,11 @@ WRONG = {
     ),
     "a name of a method": (
         ("frequency: ", "velocity: "),
-        "Wave.velocity has a name that each controller has already",
+        "Wave.velocity: the base class already has this name",
     ),
     "a name of the entry": (
         ("frequency: ", "rate: "),
-        "Wave.rate has a name that each controller has already; rename",
+        "Wave.rate: the base class already has this name; rename",
     ),
 }
 

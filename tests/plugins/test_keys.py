@@ -352,5 +352,5 @@ def test_a_command_that_does_not_fit_is_refused_in_words(
 def test_a_command_of_another_controller_is_refused() -> None:
     group, other = type_of("joint_group_position_controller"), type_of("joint_group_posvel_controller")
     command = other.Commands["posvel"].model_validate({"positions": [1], "velocities": [1]})
-    with pytest.raises(ValueError, match="takes no command 'posvel'"):
+    with pytest.raises(ValueError, match="has no command 'posvel'"):
         group.prepare("posvel", command, group.Parameters.model_validate(TWO))

@@ -109,8 +109,8 @@ def test_a_clients_name_may_be_any_text(place):
         ),
         ({"points": [{"time": float("inf")}]}, r"points\[0\].time is inf, but must be a finite number"),
         ({"positions": np.array([1.0, np.inf])}, r"positions\[1\] is inf, but must be"),
-        ({"positions": {1, 2}}, "this cannot be sent: set is not JSON"),
-        ({"positions": "a" * MOST_BYTES}, "bytes are too many, at most 1048576"),
+        ({"positions": {1, 2}}, "the request cannot be sent: set cannot be written as JSON"),
+        ({"positions": "a" * MOST_BYTES}, "the request has 1048593 bytes, more than 1048576"),
     ],
 )
 def test_what_cannot_be_sent_is_refused_here(peer, command, sentence):
@@ -187,13 +187,11 @@ def test_a_connection_that_was_idle_for_long_is_not_used_again(peer, monkeypatch
 
 
 def test_the_choice_of_a_robot_must_be_clear():
-    with pytest.raises(dxlrun.DxlrunError, match="no robot runs that can be steered; start one"):
+    with pytest.raises(dxlrun.DxlrunError, match="no running robot found; start one"):
         dxlrun.connect()
     with create_listener("torso")[0]:
         assert dxlrun.connect().name == "torso"
-        with pytest.raises(
-            dxlrun.DxlrunError, match="no robot pair runs that can be steered; these do: torso"
-        ):
+        with pytest.raises(dxlrun.DxlrunError, match="robot pair is not running; choose one of: torso"):
             dxlrun.connect("pair")
         with create_listener("pair")[0]:
             assert dxlrun.connect("pair").name == "pair"

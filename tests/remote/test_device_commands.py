@@ -66,11 +66,12 @@ def test_a_devices_commands_go_to_the_controller_that_has_them(board):
         ("board", {"led": -0.5}, "led of board: -0.5 is outside 0 to 1"),
         ("board", {"led": True}, "board/led = True is not a number"),
         ("board", {"led": "on"}, "board/led = on is not a number"),
-        ("board", {"lde": 1}, "board takes no command lde; did you mean led?"),
+        ("board", {"lde": 1}, "board has no command lde; did you mean led?"),
         (
             "board",
             {},
-            "no command of board (ID 102 on bus main) is named; name one of led, register_7, register_8",
+            "the request names no command of board (ID 102 on bus main); "
+            "name one of led, register_7, register_8",
         ),
         ("foot", {"led": 1}, "foot (ID 101 on bus main) has no commands"),
         ("board", {"register_8": 1}, "commanded by no controller; `dxlrun switch --activate away`"),
@@ -131,7 +132,7 @@ def test_states_of_a_device_are_asked_for_by_name_and_listened_to(board):
     _, content = board.ask("GET", "/joints/board/registers/led")
     assert (
         content["refused"]
-        == "there is no joint board; it is not a servo: `dxlrun get board` prints its states"
+        == "there is no joint board; board is not a servo; print its states by `dxlrun get board`"
     )
     opened, sample = board.frames(board.link.open_stream(["/foot"], newest=False))
     assert (opened.type, sample.number) == ("dxlrun_msgs/msg/SourceStates", 2)

@@ -96,7 +96,7 @@ WRONG = [
     ("POST", "/controllers/left/commands/break", {"count": 1}, 422, "invalid", "KeyError: 'a mistake of its author'"),
     ("POST", "/controllers/left/commands/leave", {"count": 1}, 422, "invalid", "SystemExit: 3"),
     ("POST", "/controllers/left/commands/many", {"count": 40_000}, 413, "too_long", "320000 bytes are too many"),
-    ("POST", "/controllers/left/set-points/many", {"count": 600}, 413, "too_long", "send it as a command"),
+    ("POST", "/controllers/left/set-points/many", {"count": 600}, 413, "too_long", "send the values as a command"),
     ("POST", "/controllers/spare/set-points/go", {"positions": [0]}, 409, "not_active", "not active; switch to it first"),
     ("POST", SET_POINT + "?lease=0", {"positions": [0]}, 422, "invalid", "a lease of 0 s is out of range; write 0.01 to 60 s"),
     ("POST", SET_POINT + "?lease=61", {"positions": [0]}, 422, "invalid", "a lease of 61 s is out of range; write 0.01 to 60 s"),
@@ -116,7 +116,7 @@ WRONG = [
     ("POST", "/controllers", LOAD | {"name": "../x"}, 422, "invalid", "is not a name"),
     ("POST", "/controllers", LOAD | {"name": 5}, 422, "invalid", "must be text"),
     ("POST", "/controllers", LOAD | {"name": "a" * 65}, 422, "invalid", "at most 64"),
-    ("POST", "/controllers", LOAD | {"name": "left"}, 409, "name_taken", "there is a controller left already"),
+    ("POST", "/controllers", LOAD | {"name": "left"}, 409, "name_taken", "the run already has a controller left"),
     ("POST", "/controllers", LOAD | {"type": "leg"}, 422, "invalid", "no plug-in offers the controller type leg"),
     ("POST", "/controllers", LOAD | {"joints": ["pam"]}, 422, "invalid", "joint pam of more is not defined; did you mean pan?"),
     ("POST", "/controllers", LOAD | {"joints": ["pan", "pan"]}, 422, "invalid", "more names joint pan twice; name it once"),
@@ -645,7 +645,7 @@ def test_a_body_that_is_too_deep_is_named_so(desk):
     assert (status, answer["code"], answer["refused"]) == (
         422,
         "invalid",
-        "the body is nested too deeply; make it flatter",
+        "the body is nested too deeply; use fewer levels",
     )
 
 

@@ -49,7 +49,7 @@ def test_a_plug_in_that_never_returns_is_interrupted_and_the_next_client_is_serv
     status, content = desk.ask("POST", "/controllers/left/commands/brood", {"count": 1})
     assert (status, content["refused"]) == (
         422,
-        "left computed for more than 0.05 s; send less at once",
+        "left needed more than 0.05 s to prepare the command; send less at once",
     )
     assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
     assert desk.ask("POST", "/stop") == (200, DONE)

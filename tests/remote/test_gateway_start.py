@@ -164,7 +164,7 @@ def test_a_robot_that_must_be_reached_begins_when_the_gateway_answers(plan, star
     for _ in range(2):
         run._look_after_gateway(heartbeat)
     assert sent == [Stop()] * refused
-    fix = "without --listen it would" if listen else "--no-gateway runs without"
+    fix = f"{'omit --listen' if listen else 'give --no-gateway'} to run without the gateway"
     assert run.sentences == (
         [f"the gateway did not start (no place), so the robot did not move; {fix}"] * len(sent)
     )

@@ -424,4 +424,4 @@ def test_a_live_parameter_that_is_no_number_is_named_and_keeps_no_other_from_cha
     assert arm.ask("POST", PARAMETERS, {"values": {"steps": 8}})[0] == 200
     status, answer = arm.ask("POST", PARAMETERS, {"values": {"label": "right"}})
     assert status == 422
-    assert "label = 'right' is neither a number nor a bool, so it cannot change in a run" in answer["refused"]
+    assert "label = 'right' cannot change in a run; only numbers and bools can" in answer["refused"]

@@ -135,7 +135,7 @@ WRONG = [
     ("positions", "position", {"pan": "soon"}, "", 422, "pan: 'soon' is not an angle"),
     ("positions", "velocity", {"pan": "1 rad/s"}, "", 404, "joints of positions take position"),
     ("whole", "velocity", {"pan": "1 rad/s"}, "", 404, "joints of whole take position"),
-    ("whole", "positions", {"positions": ["0 deg", "0 deg"]}, "", 404, "whole takes no command positions"),
+    ("whole", "positions", {"positions": ["0 deg", "0 deg"]}, "", 404, "whole has no command positions"),
     ("positions", "position", {"pan": "80 deg"}, "", 422, "pan is sent to 80 deg, outside its limits"),
     (
         "posvel",
@@ -149,7 +149,7 @@ WRONG = [
     ("whole", "position", {"pan": "0 deg"}, "&in=0", 422, "in=0 is out of range"),
     ("positions", "positions", {"positions": ["0 deg", "0 deg"]}, "&in=2", 422, "in is for joints by name"),
     ("positions", "positions", {"positions": ["0 deg"]}, "", 422, "1 positions for 2 joints"),
-    ("positions", "posvel", {"pan": "0 deg"}, "", 404, "positions takes no command posvel"),
+    ("positions", "posvel", {"pan": "0 deg"}, "", 404, "positions has no command posvel"),
     (
         "trajectory",
         "position",

@@ -159,7 +159,7 @@ POINT = "    points: [{time: 0 s, joints: {%s}}]\n"
 HEAD = "name: nod\nmotions:\n  - controller: %s\n"
 WRONG = [
     (HEAD % "leg" + POINT % "pan: {position: 0 rad}", "3:17", "the robot has no controller leg", "known: arm"),
-    (HEAD % "arm" + POINT % "tilt: {position: 0 rad}", "3:17", "controller arm is not active", "`dxlrun switch --activate arm --deactivate posvel` activates it"),
+    (HEAD % "arm" + POINT % "tilt: {position: 0 rad}", "3:17", "controller arm is not active", "activate it by `dxlrun switch --activate arm --deactivate posvel`"),
     (HEAD % "positions" + POINT % "pan: {position: 2 rad}", "4:35", "pan is sent to 114.59 deg", "change the motion or the limits"),
     (HEAD % "posvel" + POINT % "tilt: {position: 0 rad, velocity: 9 rad/s}", "4:35", "tilt is commanded to 9 rad/s", "allow more time"),
     (HEAD % "positions" + POINT % "tilt: {position: 0 rad}", "4:35", "positions does not move tilt", "known: pan"),

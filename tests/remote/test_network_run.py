@@ -165,7 +165,7 @@ def commanded(computers):
             computers.at("anna")
             computers.typed(command_of("dxlrun take-over"))
             told = [one["text"] for one in own.events()["events"] if "commander" in one["text"]]
-        assert [re.findall(r'"client":"(.*?)","instead":"(.*?)"', text) for text in told] == [
+        assert [re.findall(r"commander (.*?) instead of (.*?) from ", text) for text in told] == [
             [("client anna", "this computer")],
             [("this computer", "client anna")],
             [("client anna", "this computer")],

@@ -138,7 +138,7 @@ def test_joints_and_groups_are_named(arm, kind, names, joints):
     ("path", "body", "status", "said"),
     [
         ("/torque", {"joints": ["pen"], "on": True}, 404, "there is no joint pen; did you mean pan?"),
-        ("/torque", {"joints": [], "on": True}, 404, "name one, a group, a controller, or all"),
+        ("/torque", {"joints": [], "on": True}, 404, "name joints, groups, controllers, or all"),
         ("/torque", {"joints": ["pan"]}, 422, "missing required field `on`"),
         ("/torque", {"joints": "pan", "on": True}, 422, "Expected `array`, got `str`"),
         ("/reboot", {"joints": ["pan"], "on": True}, 422, "unknown field `on`"),
@@ -175,7 +175,7 @@ def test_a_servo_of_protocol_1_is_not_rebooted(desk):
     status, content = desk.ask("POST", "/reboot", {"joints": ["pan"]})
     assert (status, content["code"]) == (409, "not_rebooted")
     assert content["refused"] == (
-        "pan (ID 3 on bus main) knows no reboot instruction: switch the torque off and on, or the power"
+        "pan (ID 3 on bus main) has no reboot instruction; switch the torque or the power off and on"
     )
     assert desk.taken == []
 

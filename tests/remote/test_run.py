@@ -160,7 +160,7 @@ def test_refusals_have_their_reason_and_whether_the_request_itself_was_wrong(ste
     assert "hold" in sentences
     assert "pan" in sentences
     assert "pan is sent to 9999 deg, outside its limits -150..+150 deg" in sentences
-    assert "the loop must be paused for this; pause it first" in sentences
+    assert "the loop is not paused; pause it first" in sentences
 
 
 def test_clients_can_read_what_became_of_their_commands(steered):

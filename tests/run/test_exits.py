@@ -123,10 +123,10 @@ CONFIRMED = "torque off was confirmed by all 2 servos"
             ("the loop did not stop and was killed", CONFIRMED),
         ),
         ([(GUARDIAN, STOP), (LOOP, KILL), (GUARDIAN, KILL)], (CONFIRMED,)),
-        ([(GUARDIAN, STOP)], ("the guardian stopped watching the loop, and was killed",)),
+        ([(GUARDIAN, STOP)], ("the guardian stopped watching the loop and was killed",)),
         (
             [(GUARDIAN, STOP), (LOOP, KILL)],
-            ("the guardian stopped watching the loop, and was killed",),
+            ("the guardian stopped watching the loop and was killed",),
         ),
     ],
     ids=["guardian", "hung loop", "both", "stopped guardian", "stopped guardian, loop"],
@@ -196,8 +196,8 @@ def test_a_fault_of_dxlrun_itself_is_a_sentence_and_a_traceback_only_for_debug(o
 
 STANDSTILL = "time_ns < 5e8 or time.sleep(60)"
 DEATHS = {
-    "os.kill(os.getpid(), signal.SIGSEGV)": r"the loop's process ended unexpectedly \(signal SIGSEGV\)",
-    STANDSTILL: r"the loop stood still for more than 100 ms",
+    "os.kill(os.getpid(), signal.SIGSEGV)": r"the loop's process exited unexpectedly \(signal SIGSEGV\)",
+    STANDSTILL: r"the loop did not respond for more than 100 ms",
 }
 
 
@@ -219,7 +219,7 @@ def test_the_cause_of_death_names_the_controller_whose_code_ran(odd, all_limp, w
 @pytest.mark.parametrize(
     ("death", "cause"),
     [
-        ("os._exit(7)", "the loop's process ended unexpectedly (exit code 7) in on_configure"),
+        ("os._exit(7)", "the loop's process exited unexpectedly (exit code 7) in on_configure"),
         (
             "signal.signal(signal.SIGTERM, signal.SIG_IGN); time.sleep(60)",
             "the loop did not stop within 2 s in on_configure",
@@ -305,9 +305,7 @@ def test_a_log_that_is_deleted_in_the_run_fails_it(start, all_limp):
     run.signal(signal.SIGINT)
     code, out, err = run.finish()
     assert code == 1
-    assert err == (
-        "pair: the log is incomplete: its file was deleted or moved by another program during the run\n"
-    )
+    assert err == ("pair: the log is incomplete: another program deleted or moved the file during the run\n")
     assert "done" not in out
     assert log.name not in out
     assert all_limp(run)
@@ -371,13 +369,13 @@ def test_simulated_servos_that_are_gone_end_the_run(start, wait_for):
     os.kill(run.child("run.simulation_process"), signal.SIGKILL)
     code, out, err = run.finish()
     assert code == 1
-    assert "the simulated bus ended before the run did" in err
+    assert "the simulated bus exited before the end of the run" in err
     assert "torque off could not be sent" in err
     assert "Traceback" not in err
     wait_for(run.gone, "the end of every process")
     assert run.log().complete
     verdict = analyze(run.log()).verdict
-    assert "The run failed: the simulated bus ended before the run did." in verdict.sentences
+    assert "The run failed: the simulated bus exited before the end of the run." in verdict.sentences
     assert "  main: bus main on sim: sim is gone" in out
 
 

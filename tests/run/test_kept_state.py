@@ -181,8 +181,8 @@ def test_without_a_directory_nothing_is_kept(robot):
 @pytest.mark.parametrize(
     ("change", "why"),
     [
-        ({"id": "4"}, "pan ID was 3 on bus main and is 4 on bus main"),
-        ({"gain": "20"}, "pan p_gain was 32 and is 20"),
+        ({"id": "4"}, "pan ID was 3 on bus main, now 4 on bus main"),
+        ({"gain": "20"}, "pan p_gain was 32, now 20"),
     ],
 )
 def test_another_servo_begins_anew_and_says_why(robot, tmp_path, change, why):
@@ -223,7 +223,7 @@ def damaged(data: bytes) -> dict[str, tuple[bytes, str]]:
     middle = len(data) // 2
     foreign = b"".join(file_pieces("another", b"state", {})[1])
     return {
-        "empty": (b"", "is not a kept state of this version"),
+        "empty": (b"", "is not a state of a controller, or was saved by another version"),
         "cut": (data[:-1], "is damaged or incomplete"),
         "half": (data[:middle], "is damaged or incomplete"),
         "torn": (data[:middle] + bytes(len(data) - middle), "is damaged or incomplete"),
@@ -233,9 +233,15 @@ def damaged(data: bytes) -> dict[str, tuple[bytes, str]]:
         ),
         "longer": (data + b"x", "is damaged or incomplete"),
         "too long": (bytes(LONGEST_FILE + 1), f"is longer than {LONGEST_FILE} bytes"),
-        "noise": (random.Random(1).randbytes(5000), "is not a kept state of this version"),
-        "version": (data.replace(b"state 1", b"state 2"), "is not a kept state of this version"),
-        "foreign": (foreign, "is of another controller, another"),
+        "noise": (
+            random.Random(1).randbytes(5000),
+            "is not a state of a controller, or was saved by another version",
+        ),
+        "version": (
+            data.replace(b"state 1", b"state 2"),
+            "is not a state of a controller, or was saved by another version",
+        ),
+        "foreign": (foreign, "belongs to another controller, another"),
     }
 
 
@@ -257,7 +263,7 @@ def test_what_is_no_file_does_not_block_the_start(robot, tmp_path):
     os.mkfifo(kept / "runs.kept")
     assert number(run(robot, kept, log)) == 0
     ((_, text),) = said(log)
-    assert "its file is not a regular file" in text
+    assert "the state's path is not a regular file" in text
 
 
 def test_a_full_disk_leaves_the_old_file_and_says_so(robot, tmp_path):
@@ -271,7 +277,7 @@ def test_a_full_disk_leaves_the_old_file_and_says_so(robot, tmp_path):
         assert made.run().detail == ""
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-    assert made.unkept == (f"what runs learned last is not kept in {kept}: {os.strerror(errno.EFBIG)}",)
+    assert made.unkept == (f"the last state of runs was not saved in {kept}: {os.strerror(errno.EFBIG)}",)
     assert (kept / "runs.kept").read_bytes() == before
     assert [path.name for path in kept.iterdir()] == ["runs.kept"]
     assert number(run(robot, kept)) == 1
@@ -380,7 +386,7 @@ def test_a_controller_that_is_not_declared_to_keep_is_ended(robot, installed):
     finally:
         plugin.write_text(PLUGIN)
         sys.modules.pop("runs", None)
-    assert "set `keeps = True` in its class" in result.detail
+    assert "set it in the controller's class" in result.detail
 
 
 # Kills

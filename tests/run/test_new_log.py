@@ -90,7 +90,7 @@ def test_a_name_too_long_is_an_input_error(tmp_path):
 def test_the_home_directory_is_meant_by_a_tilde(tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path))
     assert new_log(RecordingPlan(str(Path("~/logs"))), "pair").parent == tmp_path / "logs"
-    with pytest.raises(InputError, match="write its whole path"):
+    with pytest.raises(InputError, match="write its absolute path"):
         new_log(RecordingPlan(str(Path("~nobody_of_this_name/logs"))), "pair")
 
 

@@ -237,4 +237,4 @@ def test_one_survivor_takes_torque_off(  # noqa: PLR0917  fixtures
     err = end_what_is_left(run, wait_for)
     assert not any(servos.torque().values())
     if (first, second) == (Hit("main", "STOP"), Hit("gateway", "STOP")):  # as `fg` shows it
-        assert "was stopped, as by Ctrl-Z, and could not end the run any more" in " ".join(err.split())
+        assert "was suspended (such as by Ctrl-Z)" in " ".join(err.split())

@@ -99,7 +99,7 @@ def test_the_guardian_holds_a_robot_whose_loop_is_gone_when_the_policy_is_hold(h
     os.kill(run.child("dxlrun.run.loop_process"), signal.SIGKILL)
     code, _, err = run.finish()
     assert code == 1
-    assert "the loop's process ended unexpectedly (signal SIGKILL)" in err
+    assert "the loop's process exited unexpectedly (signal SIGKILL)" in err
     assert "torque stays on, as the policy says" in err
     assert not all_limp(run)
 

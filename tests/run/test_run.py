@@ -89,7 +89,9 @@ def test_killing_the_recorder_does_not_stop_the_robot(start, all_limp, wait_for)
     before = len(goals(run))
     code, out, err = run.finish()
     assert code == 1
-    (sentence,) = [line for line in err.splitlines() if "the recorder ended before the run did" in line]
+    (sentence,) = [
+        line for line in err.splitlines() if "the recorder exited before the end of the run" in line
+    ]
     assert run.log().damage[0].endswith(sentence.partition("can be read: ")[2])
     assert "its last cycle is at" in sentence
     assert "pair: failed: ran for 3." in out

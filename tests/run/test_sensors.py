@@ -165,7 +165,7 @@ def test_a_sensor_that_dies_sends_nan_or_stops_and_comes_back(tmp_path, unit, mo
     assert process.returncode == 0  # it closed its device in time
     assert time.monotonic() - began < source_process.END_S
     assert events[:5] == [
-        "its process ended (signal SIGKILL), another one is started",
+        "its process exited (signal SIGKILL) and is restarted",
         "has failed; its values are not valid",
         "delivers samples again",
         "angular_velocity.z is nan; its values are not used",
@@ -208,7 +208,7 @@ def test_a_sensor_that_dies_sends_nan_or_stops_costs_the_run_nothing_but_its_row
     assert run.gone()
     log = run.log()
     found = [(event.code, event.text) for event in log.events if event.source == "imu"]
-    ended = "sensor imu: its process ended (signal SIGKILL), another one is started"
+    ended = "sensor imu: its process exited (signal SIGKILL) and is restarted"
     nan = "sensor imu: angular_velocity.z is nan; its values are not used"
     expected = [
         (SensorEvent.SENSOR, ended),
@@ -335,7 +335,7 @@ def test_a_sensor_that_spoils_its_memory_costs_only_itself_and_its_children_end(
     if killed:
         os.kill(child.process.pid, signal.SIGKILL)
         until(lambda: sensor.child is None, check=sensor.supervise_process)
-        assert (reader.state, reader.read_text()[:17]) == (SlotState.ENDED, "its process ended")
+        assert (reader.state, reader.read_text()[:18]) == (SlotState.ENDED, "its process exited")
     else:
         sensor.end_process()
     assert select.select([pidfd], [], [], DEADLINE_S)[0]

@@ -62,7 +62,7 @@ def test_stop_leaves_a_run_without_a_gateway_its_pose_at_the_end(  # noqa: PLR09
     said = dxlrun("list")
     assert said.err == (
         "dxlrun: bare_arm runs but cannot be steered: it has no gateway; "
-        "`dxlrun stop --robot bare_arm` ends it\n"
+        "end it by `dxlrun stop --robot bare_arm`\n"
     )
     if asked_before == "by Ctrl-C":
         running.signal(signal.SIGINT)
@@ -123,7 +123,7 @@ def test_a_run_that_starts_is_not_called_one_that_cannot_be_steered(
         return any(one.pid == pid for run in found_runs() if run.process("loop") for one in run.processes)
 
     wait_for(found, "its loop")
-    starting = "pair is starting and cannot be steered yet; try again when it runs"
+    starting = "pair is starting; try again when it runs"
     assert dxlrun("list").err == f"dxlrun: {starting}\n"
     assert dxlrun("halt").err == f"dxlrun: {starting}\n"
     go.touch()

@@ -156,7 +156,7 @@ def test_the_guardian_says_that_other_programs_kept_the_loop_from_running(watche
         found.append(reason_to_kill(made, processor(50, "R")))
     assert set(found) == {None, "hung"}
     how = made._how("hung", None)  # type: ignore[arg-type]  # asked of one that ended by itself
-    said = " and was killed; it was ready to run, but got a processor for only 0.0 ms of that"
+    said = " and was killed; it was ready to run but received only 0.0 ms of processor time"
     assert said + fix in how
     assert how.endswith("that") == (not fix)
 
@@ -228,7 +228,7 @@ def test_a_loop_that_never_gets_on_is_ended(  # noqa: PLR0917  fixtures
     control.close()
     line.close()
     assert ended == ending
-    assert watcher._how(ended, loop) == f"the loop stood still for more than 100 ms{how} and was killed"
+    assert watcher._how(ended, loop) == f"the loop did not respond for more than 100 ms{how} and was killed"
 
 
 class Unwatched(LoopWatch):
@@ -641,7 +641,7 @@ def test_a_supervisor_waits_for_a_guardian_only_shortly_once_torque_is_to_be_cut
     monkeypatch.setattr(supervisor, "time", SimpleNamespace(monotonic_ns=lambda: guardian.now_ns))
     run.watch_guardian(guardian, lambda heartbeat: None)  # type: ignore[arg-type]  # what stands for the guardian
     assert least_s < guardian.killed_ns * 1e-9 <= most_s
-    assert run.sentences == ["the guardian stopped watching the loop, and was killed"]
+    assert run.sentences == ["the guardian stopped watching the loop and was killed"]
     guardian.channel.close()
     guardian.theirs.close()
 

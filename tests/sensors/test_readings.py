@@ -180,7 +180,7 @@ def test_a_sample_that_is_not_finite_is_an_event_and_never_in_the_record(desk, w
 def test_the_end_of_its_process_is_an_event_and_its_row_is_not_valid_at_once(desk):
     desk.sample(1.0)
     desk.cycle(1)
-    desk.writer.write_state(SlotState.ENDED, "its process ended (signal SIGKILL), another one is started")
+    desk.writer.write_state(SlotState.ENDED, "its process exited (signal SIGKILL) and is restarted")
     assert desk.cycle(1)[1] is False
     assert desk.events[0][:2] == (SensorEvent.SENSOR, Severity.ERROR)
     assert [code for code, _ in desk.told()] == [SensorEvent.SENSOR, SensorEvent.SENSOR_LOST]

@@ -133,8 +133,8 @@ def test_garbage_is_no_sample_and_ends_no_reader():
         memory[:] = b"\xff" * len(memory) if turn == 0 else chance.randbytes(len(memory))
         assert (reader.read_sample(), reader.read_text(), reader.state) == (None, "", SlotState.FAILED)
         writer = SlotWriter(memory)
-        writer.write_state(SlotState.ENDED, "its process ended")
-        assert (reader.read_text(), reader.state) == ("its process ended", SlotState.ENDED)
+        writer.write_state(SlotState.ENDED, "its process exited")
+        assert (reader.read_text(), reader.state) == ("its process exited", SlotState.ENDED)
         writer.write_sample(turn + 1, np.full(VALUES, 3.0))
         assert (reader.read_sample(), SlotReader(memory).values) == (turn + 1, VALUES)
 

@@ -200,7 +200,7 @@ def test_a_user_who_may_not_open_them_is_given_the_way(plugged_in: Callable[...,
 def test_without_evdev_the_pip_line_is_given(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "evdev", None)
     with pytest.raises(
-        InputError, match=r"needs evdev, which is not installed; `pip install 'dxlrun\[teleop\]'` installs it"
+        InputError, match=r"needs evdev \(not installed\); install it: `pip install 'dxlrun\[teleop\]'`"
     ):
         chosen(None)
 

@@ -35,7 +35,7 @@ def test_its_commands_do_what_they_say(
     if words[0] == "teleop":
         said = dxlrun(*words)
         assert (said.code, said.out) == (1, "")
-        assert "no robot runs that can be steered" in said.err
+        assert "no running robot found" in said.err
     else:
         assert dxlrun(*words, "--virtual", "--duration", "0.1", "--no-record").code == 0
 

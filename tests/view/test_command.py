@@ -101,9 +101,9 @@ def test_without_a_robot_it_says_how_one_starts(view: View, command: str) -> Non
         ((str(ROOT / "robots/bioloid_torso.yaml"),), 1, "start it in another terminal"),
         (("bad.mcap",), 2, "bad.mcap"),
         (("--listen", ":99999999"), 2, "HOST:PORT"),
-        (("{log}", "--listen", "127.0.0.99999"), 2, "`dxlrun keys robot bioloid_torso_imu` makes it"),
-        (("{log}", "--listen", "192.0.2.1"), 2, "`dxlrun keys robot bioloid_torso_imu` makes it"),
-        (("{log}", "--listen", "::"), 2, "`dxlrun keys robot bioloid_torso_imu` makes it"),
+        (("{log}", "--listen", "127.0.0.99999"), 2, "make it by `dxlrun keys robot bioloid_torso_imu`"),
+        (("{log}", "--listen", "192.0.2.1"), 2, "make it by `dxlrun keys robot bioloid_torso_imu`"),
+        (("{log}", "--listen", "::"), 2, "make it by `dxlrun keys robot bioloid_torso_imu`"),
     ],
 )
 def test_what_cannot_be_shown_is_refused(

@@ -80,7 +80,7 @@ def test_no_byte_of_the_page_without_a_certificate_that_counts(
 
 
 def test_a_robot_without_a_certificate_is_not_served(browse: Browse) -> None:
-    with pytest.raises(InputError, match="`dxlrun keys robot arm` makes it"):
+    with pytest.raises(InputError, match="make it by `dxlrun keys robot arm`"):
         server_context("arm")
 
 

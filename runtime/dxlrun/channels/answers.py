@@ -53,22 +53,22 @@ class Code(StrEnum):
     INACTIVE_ALREADY = "inactive_already", "{controller} is not active"
     ACTIVE_ALREADY = "active_already", "{controller} is active already"
     STILL_ACTIVE = "still_active", "{controller} is active; deactivate it first"
-    JOINTS_CLAIMED = "joints_claimed", "{conflict}; deactivate the other one in the same switch"
+    JOINTS_CLAIMED = "joints_claimed", "{conflict}; deactivate one of them in the same switch"
     COMMANDED = "commanded", "{controller} is commanded by {upper}"
     NO_NEW_REFERENCES = (
         "no_new_references",
-        "{controller} exports references or provides states, so it must be in the robot file; add it there "
-        "and start the run again",
+        "{controller} exports references or provides states, so it cannot be loaded; "
+        "add it to the robot file and start the run again",
     )
     MODE_NOT_ENTERED = "mode_not_entered", "{controller} is not activated: {problem}"
     SWITCHED_AGAIN = "switched_again", "another switch deactivated {controller} before it was active"
     CONTROLLER_FAULT = "controller_fault", "{problem}"
-    NAME_TAKEN = "name_taken", "there is a controller {controller} already"
+    NAME_TAKEN = "name_taken", "the run already has a controller {controller}"
     TOO_MANY_CONTROLLERS = (
         "too_many_controllers",
-        "the run has {most} controllers already, and cannot have more; unload one",
+        "the run has {most} controllers, the maximum; unload one first",
     )
-    NOT_IN_PAUSE = "not_in_pause", "the loop must be paused for this; pause it first"
+    NOT_IN_PAUSE = "not_in_pause", "the loop is not paused; pause it first"
     # goals and parameters
     UNKNOWN_TOPIC = "unknown_topic", "there is no topic {topic}; there are {topics}"
     UNKNOWN_GOAL = "unknown_goal", "there is no goal {goal}; the newest is {last}"
@@ -89,7 +89,7 @@ class Code(StrEnum):
     RATE_UNDER_WATCHDOG = "rate_under_watchdog", "the Bus Watchdog needs at least {lowest:.4g} Hz"
     RATE_UNDER_EXIT = (
         "rate_under_exit",
-        "at less than {lowest:.2g} Hz the run would not end within exit_timeout",
+        "below {lowest:.2g} Hz the run cannot end within exit_timeout; choose a higher rate",
     )
     RATE_NOT_DIVIDED = (
         "rate_not_divided",
@@ -97,7 +97,7 @@ class Code(StrEnum):
     )
     RATE_BELOW_UPPER = (
         "rate_below_upper",
-        "at {rate:g} Hz {upper} would command {controller} in cycles without an update of {controller}",
+        "at {rate:g} Hz, some updates of {upper} fall between updates of {controller}; choose another rate",
     )
     # joints
     UNKNOWN_JOINT = "unknown_joint", "there is no joint {joint}"
@@ -111,7 +111,7 @@ class Code(StrEnum):
     )
     JOINT_LIMP = "joint_limp", "{servo} is limp"
     JOINT_LOST = "joint_lost", "{servo} does not answer"
-    HARDWARE_ERROR = "hardware_error", "{servo} has a hardware error, and gets no torque"
+    HARDWARE_ERROR = "hardware_error", "{servo} has a hardware error, so its torque stays off"
     STILL_MOVING = (
         "still_moving",
         "all controllers are deactivated, but after {seconds:.1f} s {joint} still moves at "
@@ -120,17 +120,17 @@ class Code(StrEnum):
     TORQUE_NOT_SWITCHED = "torque_not_switched", "{problem}"
     NOT_REBOOTED = "not_rebooted", "{problem}"
     # commands
-    UNKNOWN_COMMAND = "unknown_command", "{controller} takes no command {kind}"
+    UNKNOWN_COMMAND = "unknown_command", "{controller} has no command {kind}"
     INVALID = "invalid", "{problem}"
     WRONG_QUANTITY = "wrong_quantity", "{problem}"
     WRONG_MOTION = "wrong_motion", "{problem}"
     BEYOND_LIMITS = "beyond_limits", "{kind} of {controller}: {problem}"
     TOO_SLOW = (
         "too_slow",
-        "{controller} computed for more than {seconds:g} s; send less at once",
+        "{controller} needed more than {seconds:g} s to prepare the command; send less at once",
     )
     # clients
-    NOT_ALLOWED = "not_allowed", "{client} has the role {role}, but this needs the role {needed}"
+    NOT_ALLOWED = "not_allowed", "{client} has the role {role}; the request needs the role {needed}"
     COMMANDED_BY = (
         "commanded_by",
         "{commander} commands this robot; wait until it has sent no command for {seconds:g} s, or use "
@@ -138,15 +138,15 @@ class Code(StrEnum):
     )
     # requests
     UNKNOWN_PAGE = "unknown_page", "{method} {path} is not a request of this version of dxlrun"
-    WRONG_METHOD = "wrong_method", "{path} takes no {method}"
-    TOO_LONG = "too_long", "{size} bytes are too many, at most {most}; send less at once"
+    WRONG_METHOD = "wrong_method", "{path} does not support {method}"
+    TOO_LONG = "too_long", "the request has {size} bytes, more than {most}; send less at once"
     BODY_TIMEOUT = "body_timeout", "the request did not arrive within {seconds:g} s"
     TOO_OFTEN = (
         "too_often",
-        "more than {rate:g} requests a second, or too many bytes in them; reduce the request rate",
+        "more than {rate:g} requests a second, or too many bytes; reduce the request rate",
     )
     QUEUE_FULL = "queue_full", "the command queue is full; reduce the request rate"
-    GATEWAY_FAILED = "gateway_failed", "the gateway failed: {problem}; --debug shows where"
+    GATEWAY_FAILED = "gateway_failed", "the gateway failed: {problem}; run with --debug for details"
 
 
 class Halted(msgspec.Struct, frozen=True):

@@ -368,7 +368,7 @@ class Child(Generic[Received]):
         message = self.next_message(START_TIMEOUT_S)
         if message is None:
             code = self.process.wait(END_TIMEOUT_S)
-            raise ProcessFault(f"the {self.name} ended while it started (exit code {code}); try --debug")
+            raise ProcessFault(f"the {self.name} exited during start-up (exit code {code}); try --debug")
         if isinstance(message, Failed):
             raise PortError(message.sentence)
         return message

@@ -313,7 +313,7 @@ class CycleLayout:
         source_commands: Sequence[str] = (),
     ) -> None:
         if len(controllers) > MOST_CONTROLLERS:
-            raise ValueError(f"at most {MOST_CONTROLLERS} controllers, not {len(controllers)}")
+            raise ValueError(f"{len(controllers)} controllers, more than {MOST_CONTROLLERS}")
         self.joints = tuple(joints)
         self.controllers = tuple(controllers)
         self.references = tuple(references)

@@ -97,31 +97,31 @@ def opened_file(data: bytes, controller: str) -> tuple[bytes, Facts]:
     if len(data) > LONGEST_FILE:
         raise ValueError(f"is longer than {LONGEST_FILE} bytes")
     if not data.startswith(_MAGIC):
-        raise ValueError("is not a kept state of this version")
+        raise ValueError("is not a state of a controller, or was saved by another version")
     end = data.find(b"\n")
     if end < 0 or crc32(data[:-_CRC_BYTES]).to_bytes(_CRC_BYTES, "little") != data[-_CRC_BYTES:]:
         raise ValueError("is damaged or incomplete")
     try:
         line = msgspec.json.decode(data[len(_MAGIC) : end], type=_FirstLine)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
-        raise ValueError(f"has a first line that cannot be read ({error})") from error
+        raise ValueError(f"has an unreadable first line ({error})") from error
     state = data[end + 1 : -_CRC_BYTES]
     if line.controller != controller:
-        raise ValueError(f"is of another controller, {line.controller}")
+        raise ValueError(f"belongs to another controller, {line.controller}")
     if len(state) != line.bytes or len(state) > MOST_KEPT:
-        raise ValueError("has another length than it declares")
+        raise ValueError("has the wrong length")
     return state, line.made_with
 
 
 def difference(then: Mapping[str, str], now: Mapping[str, str]) -> str:
     """Return the first fact that has changed, as a clause:
 
-    `elbow model was MX-64 and is MX-28`; empty if equal.
+    `elbow model was MX-64, now MX-28`; empty if equal.
     """
     for name in (*now, *(name for name in then if name not in now)):
-        was, is_ = then.get(name, "not there"), now.get(name, "not there")
+        was, is_ = then.get(name, "absent"), now.get(name, "absent")
         if was != is_:
-            return f"{name} was {was} and is {is_}"
+            return f"{name} was {was}, now {is_}"
     return ""
 
 

@@ -84,7 +84,7 @@ class PacketBatch(PacketLog):
         self._words[_POSITION] = writer.head
         self._words[_CYCLE] = cycle + 1 << _MARK_BITS
         if self._room <= RECORD_HEADER:
-            raise ValueError(f"a desk of {self._room} bytes holds no packet")
+            raise ValueError(f"a buffer of {self._room} bytes cannot hold a packet")
         self.commit_packets: Callable[[], object] = self._hand_on
         """Appends the collected packets as one batch to the ring, if there are any."""
         if isinstance(writer, RingWriter):
@@ -173,7 +173,7 @@ def split_packets(payload: Payload) -> list[BatchedPacket]:
     try:
         earlier, now = _BATCH.unpack_from(payload)
     except struct.error as error:
-        raise ValueError(f"a batch of logged packets has no cycle: {error}") from error
+        raise ValueError(f"a batch of logged packets has no cycle number: {error}") from error
     mark = start + now % (1 << _MARK_BITS)
     earlier, number = earlier - 1, (now >> _MARK_BITS) - 1
     while start < end:
@@ -182,7 +182,7 @@ def split_packets(payload: Payload) -> list[BatchedPacket]:
         except struct.error as error:
             raise ValueError(f"a batch of logged packets ends inside a header: {error}") from error
         if kind not in _KINDS:
-            raise ValueError(f"a packet is of kind {kind}, which is none")
+            raise ValueError(f"a packet is of the unknown kind {kind}")
         cycle = earlier if start < mark else number
         start += RECORD_HEADER
         data = bytes(payload[start : start + length])

@@ -190,9 +190,7 @@ class RingWriter(_Ring):
 
     def _require(self, length: int) -> None:
         if length > self.longest:
-            raise ValueError(
-                f"a record of {length} bytes does not fit this ring, its longest is {self.longest}"
-            )
+            raise ValueError(f"a record of {length} bytes is longer than the ring's maximum, {self.longest}")
 
     @property
     def taken(self) -> int:

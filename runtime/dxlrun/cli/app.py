@@ -325,7 +325,7 @@ def _explained(error: Exception, tokens: Sequence[str]) -> tuple[tuple[str, ...]
         return (_usage_error(error, tokens),), InputError.exit_code
     if isinstance(error, OSError):
         where = f"{error.filename}: " if error.filename else ""
-        return (f"{where}{error.strerror or error}; --debug shows what was being done",), 1
+        return (f"{where}{error.strerror or error}; run with --debug for details",), 1
     what = " ".join(f"{type(error).__name__}: {error}".split())
     if sys.platform != "linux" and isinstance(error, ImportError | AttributeError):
         return (f"`dxlrun {verb}` needs Linux, and this is {sys.platform}: {what}",), InputError.exit_code
@@ -334,4 +334,4 @@ def _explained(error: Exception, tokens: Sequence[str]) -> tuple[tuple[str, ...]
         return (
             f"command {verb} ({place}) failed: {what}; reinstall its package, or report it to its author",
         ), 1
-    return (f"internal error: {what}; please report it, with what --debug prints",), 1
+    return (f"internal error: {what}; please report it with the output of --debug",), 1

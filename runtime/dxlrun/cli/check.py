@@ -67,7 +67,7 @@ def check_robot(
         New log file for all packets of --online.
     """
     if log is not None and not online:
-        raise InputError("--log keeps what --online sends and receives; give --online too")
+        raise InputError("--log records the packets of --online; add --online")
     for file in graph or ():
         _check_picture(file)
     with BusesLog(log, f"dxlrun check {robot} --online") as packets:
@@ -130,8 +130,7 @@ def _look(result: CompiledRobot, packets: BusesLog) -> InspectionResult:
     buses = [bus for bus in result.plan.buses if bus.port != SIMULATED]
     if not buses:
         raise InputError(
-            f"every bus of {result.plan.robot} is simulated, so there are no servos to read; "
-            "give it a port, such as port:=/dev/ttyUSB0"
+            f"all buses of {result.plan.robot} are simulated; give a port, such as port:=/dev/ttyUSB0"
         )
     joints = result.plan.loop.joints
     moved = {servo: joints[joint] for joint, servo in result.plan.mechanics.own_servos(len(joints))}
@@ -189,7 +188,7 @@ def _named(kind: Kind, **keys: str) -> Iterator[tuple[Column, str]]:
 
 _POLICIES: Columns[PolicyRow] = [
     *_named("name", policy="name"),
-    *_named("text", does="does", **{"when the loop is gone": "without_loop"}),
+    *_named("text", does="does", **{"when the loop has exited": "without_loop"}),
     (Column("at most", form="{:.1f} s"), lambda row: row.longest or None),
 ]
 _MOTIONS: Columns[Row] = [
@@ -347,4 +346,4 @@ def _deviations(deviations: Sequence[DeviationRow]) -> Table:
         *_named("number", address="address", found="found", factory="factory"),
         *_named("text", effect="effect"),
     ]
-    return Table.listing("Settings that are not the factory's", columns, deviations)
+    return Table.listing("Settings that differ from the factory's", columns, deviations)

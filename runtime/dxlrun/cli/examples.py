@@ -95,7 +95,7 @@ def _list(found: Sequence[Example], *, as_json: bool) -> None:
     rows = [(one.name, one.servos, ", ".join(one.motions), one.about) for one in found]
     show_parts(
         Table.from_rows("", columns, rows),
-        f"`dxlrun examples NAME [DIR]` copies one and its motions into DIR, without it {_HERE}",
+        f"copy an example with its motions: `dxlrun examples NAME [DIR]` (default of DIR: {_HERE})",
     )
 
 
@@ -166,8 +166,7 @@ def _copy(source: Path, directory: Path, files: Sequence[str]) -> None:
     if taken:
         raise InputError(
             "\n".join(
-                f"{path} is there already, with other contents, and stays; choose another directory"
-                for path in taken
+                f"{path} already exists with other contents; choose another directory" for path in taken
             )
         )
     for path, text in missing.items():

@@ -56,9 +56,7 @@ def frames(
         Draw the graph of the frames into an .svg or .dot file. Without a file, this option has no effect.
     """
     if of is None and (at or relative_to):
-        raise InputError(
-            "--at and --relative-to are for one frame; name it by --of, without it the tree is drawn"
-        )
+        raise InputError("--at and --relative-to need a frame; name it by --of")
     for file in graph or ():
         # Imported here because most calls draw nothing.
         from dxlrun.output.graph_picture import check_picture
@@ -85,7 +83,7 @@ def _tree(plan: Plan, robot: Path) -> FrameTree:
     from dxlrun.description.frames.tree import FrameTree
 
     if plan.urdf is None or plan.frames is None:
-        raise InputError(f"{robot} names no URDF, so there are no frames; write `model: {{urdf: NAME.urdf}}`")
+        raise InputError(f"{robot} has no URDF and so no frames; write `model: {{urdf: NAME.urdf}}`")
     return FrameTree.from_urdf(plan.urdf, plan.frames)
 
 
@@ -145,7 +143,7 @@ def _what(plan: Plan, tree: FrameTree, frame: Frame) -> str:
     return (
         words
         if frame.moved_by == "mimic"
-        else f"{words}, no servo moves it: stays at {_rest(tree, joint.name)}"
+        else f"{words}, without a servo: stays at {_rest(tree, joint.name)}"
     )
 
 

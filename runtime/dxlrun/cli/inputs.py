@@ -198,7 +198,7 @@ def check_report(target: Path, library: str = "matplotlib") -> None:
     `library`: Python library that draws the plots and must be installed.
     """
     if target.suffix.lower() not in {".html", ".htm"}:
-        raise InputError(f"a report is an HTML file, so its name ends in .html, not as {target} does")
+        raise InputError(f"{target} is not a name for a report; end it in .html")
     check_target(target, REPORT_MARK)
     if missing := missing_extra("a report", "report", library):
         raise InputError(missing)
@@ -217,18 +217,17 @@ def known_file(robot: Path) -> None:
     if robot.is_dir():
         raise InputError(f"{word} is a directory; give the robot file in it")
     if robot.suffix in (".yaml", ".yml") or len(robot.parts) > 1:
-        raise InputError(f"there is no robot file {word}; {_other_file(robot)}")
+        raise InputError(f"robot file {word} not found; {_other_file(robot)}")
     if package := verb_registry.package_of(word):
         raise InputError(
-            f"`dxlrun {word}` is a command of the package {package}, which cannot be imported here; "
-            f"`dxlrun plugins` may say why, and `pip install {verb_registry.source_of(package)}` "
-            "in the source folder of dxlrun installs it"
+            f"`dxlrun {word}` needs the package {package}, and its import failed; install it in the source "
+            f"folder of dxlrun: `pip install {verb_registry.source_of(package)}`"
         )
     if (named := robot.with_suffix(".yaml")).is_file():
-        raise InputError(f"there is no file {word}; write `{named}`")
+        raise InputError(f"file {word} not found; write `{named}`")
     if is_example(robot.name):
-        raise InputError(f"there is no file {word}; `dxlrun examples {word}` copies the robot of this name")
-    otherwise = "a robot is run by `dxlrun ROBOT.yaml`, `dxlrun help` lists the commands"
+        raise InputError(f"file {word} not found; copy the example of this name by `dxlrun examples {word}`")
+    otherwise = "run a robot by `dxlrun ROBOT.yaml`, list the commands by `dxlrun help`"
     hint = suggestion(word, verb_registry.names(), otherwise)
     raise InputError(f"{word!r} is neither a command nor a robot file; {hint}")
 
@@ -236,7 +235,7 @@ def known_file(robot: Path) -> None:
 def _other_file(robot: Path) -> str:
     """Return a suggestion for the name of a missing robot file, from the files in its directory."""
     beside = [path.name for path in robot.parent.glob("*.y*ml")] if robot.parent.is_dir() else []
-    copies = f"`dxlrun examples {robot.stem}` copies the robot of this name"
+    copies = f"copy the example of this name by `dxlrun examples {robot.stem}`"
     return suggestion(robot.name, beside, copies if is_example(robot.stem) else "check the path")
 
 
@@ -249,7 +248,7 @@ def examples_directory() -> Path:
     for place in (package / "examples", package.parents[1] / "robots"):
         if place.is_dir():
             return place
-    raise DxlrunError("this installation of dxlrun has no examples; install it again")
+    raise DxlrunError("this installation of dxlrun has no examples; reinstall it")
 
 
 def is_example(name: str) -> bool:

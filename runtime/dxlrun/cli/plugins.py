@@ -194,11 +194,11 @@ def _module(name: str) -> str:
     module = name.replace("-", "_")
     if not _NAME.fullmatch(name) or len(name) > _LONGEST_NAME:
         raise InputError(
-            f"{name[:80]!r} is not a name of a package; write small letters and digits, a letter first, - or "
-            f"_ between them, at most {_LONGEST_NAME}: my_robotics"
+            f"{name[:80]!r} is not a valid name of a package; write a letter, then lower-case letters, "
+            f"digits, - or _, such as my_robotics (at most {_LONGEST_NAME} characters)"
         )
     if keyword.iskeyword(module) or module in sys.stdlib_module_names or _known(module):
-        raise InputError(f"{module} is a module that Python knows already; choose another name: my_{module}")
+        raise InputError(f"a Python module {module} exists already; choose another name, such as my_{module}")
     return module
 
 
@@ -218,7 +218,7 @@ def _template() -> Path:
     for place in (package / "plugin_template", package.parents[1] / "plugins" / "example"):
         if place.is_dir():
             return place
-    raise DxlrunError("this installation of dxlrun has no template of a plug-in; install it again")
+    raise DxlrunError("this installation of dxlrun has no template of a plug-in; reinstall it")
 
 
 def _files(template: Path, module: str) -> Iterator[tuple[Path, str]]:

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     from dxlrun.plan.recording_plan import RecordingPlan
     from dxlrun.plan.robot_plan import Plan
-    from dxlrun.run.run_summary import RunSummary
+    from dxlrun.run.run_summary import RunOptions, RunSummary
 
 
 DEMO = ("bioloid_torso.yaml", "motions/three_parts.yaml")
@@ -97,8 +97,8 @@ def run(
     leave_real_time()
     if virtual and duration is None and not play:
         raise InputError(
-            "on virtual time nothing ends a run, and its log would fill the disk: give "
-            "--duration SECONDS, or --play MOTION.yaml"
+            "a run on virtual time needs an end, or its log fills the disk; give --duration SECONDS, or "
+            "--play MOTION.yaml"
         )
     result = compiled(robot, assignments, play, duration, None if virtual else read_models)
     for warning in result.warnings:
@@ -106,8 +106,8 @@ def run(
     if ledger is not None:
         if not result.plan.simulated:
             raise InputError(
-                f"a ledger records what simulated buses saw, and {result.plan.robot} has none: give the "
-                "argument port:=sim, or omit --ledger"
+                f"--ledger needs simulated buses, and {result.plan.robot} has none; give the argument "
+                "port:=sim, or omit --ledger"
             )
         check_target(ledger)
     if listen is not None:
@@ -123,6 +123,11 @@ def run(
         gateway=gateway,
         listen=listen or "",
     )
+    return _run_plan(result.plan, options, virtual=virtual)
+
+
+def _run_plan(plan: Plan, options: RunOptions, *, virtual: bool) -> int:
+    """Run a compiled robot and print the result; return the exit code. Raises InputError without Linux."""
     console = out()
     if not virtual and sys.platform != "linux":
         raise InputError(
@@ -132,14 +137,15 @@ def run(
     if virtual:
         from dxlrun.run.virtual_run import run_virtual
 
-        summary = run_virtual(result.plan, options, console)
+        summary = run_virtual(plan, options, console)
     else:
         from dxlrun.run.supervisor import run_robot
 
-        summary = run_robot(result.plan, options, console)
-    return show_summary(summary, result.plan, console)
+        summary = run_robot(plan, options, console)
+    return show_summary(summary, plan, console)
 
 
+@unblocked()
 def demo(*, page: PageFlag = True, virtual: Flag = False, debug: DebugFlag = False) -> int:
     """Run a simulated torso that plays a motion of 35 s.
 
@@ -153,8 +159,13 @@ def demo(*, page: PageFlag = True, virtual: Flag = False, debug: DebugFlag = Fal
         Run on virtual time, as fast as the processor allows. The page is not shown then.
     """
     robot, motion = (examples_directory() / name for name in DEMO)
+    from dxlrun.run.run_summary import RunOptions
+
+    leave_real_time()
+    # Warnings about the robot file are for its author, not for the user of the demo.
+    plan = compiled(robot, (), (motion,), None).plan
     with _page_beside(shown=page and not virtual):
-        return run(robot, play=(motion,), virtual=virtual, debug=debug)
+        return _run_plan(plan, RunOptions(debug=debug), virtual=virtual)
 
 
 @contextmanager
@@ -202,7 +213,7 @@ def _check_listen(text: str, plan: Plan, *, served: bool) -> None:
 
     address = Address.parse(text, plan.robot)
     if not (served and plan.gateway):
-        raise InputError("--listen needs the gateway of a run in real time: omit --no-gateway, --virtual")
+        raise InputError("--listen needs the gateway of a run in real time; omit --no-gateway and --virtual")
     try:
         Listener.secured(address).close()
     except OSError as error:
@@ -259,7 +270,9 @@ def _disk_lines(log: Path, recording: RecordingPlan) -> list[str]:
         command = (
             f"dxlrun logs {folder} --prune --keep {decimal(MUCH_BYTES).replace(' ', '').replace('.0', '')}"
         )
-        return [f"the logs in {folder} have {decimal(size)}; `{command}` shows the oldest, and asks"]
+        return [
+            f"the logs in {folder} have {decimal(size)}; delete the oldest by `{command}` (it asks first)"
+        ]
     lines, deleted = [], 0
     for one in oldest_beyond(folder, recording.keep_bytes, [log]):
         try:

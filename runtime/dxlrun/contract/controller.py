@@ -257,7 +257,7 @@ def _end_nothing(why: str) -> None:
 
 
 def _keep_nothing(state: bytes) -> None:
-    raise ControllerFault("kept a state, but is not declared to: set `keeps = True` in its class")
+    raise ControllerFault("kept a state without `keeps = True`; set it in the controller's class")
 
 
 class Context(msgspec.Struct, frozen=True):
@@ -422,7 +422,7 @@ class Controller(ABC, Generic[P]):
             ValueError: The command does not fit the parameters; with one sentence.
         """
         if kind not in cls.Commands:
-            raise ValueError(f"{cls.__name__} takes no command {kind!r}")
+            raise ValueError(f"{cls.__name__} has no command {kind!r}")
         joints = cls.interfaces(parameters, ()).joints
         fields = command.model_dump()
         for what, values in fields.items():

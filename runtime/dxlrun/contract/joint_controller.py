@@ -216,7 +216,7 @@ def _fields(cls: type[JointController]) -> Iterator[tuple[str, tuple[Any, Any]]]
 def _field(shown: str, name: str, kind: object, default: object) -> tuple[object, object]:
     """Return the type and the default of a parameter."""
     if hasattr(JointController, name) or name in _TAKEN:
-        raise TypeError(f"{shown} has a name that each controller has already; rename it")
+        raise TypeError(f"{shown}: the base class already has this name; rename the field")
     if isinstance(default, _Reading):
         return Annotated[str, Field(min_length=1)], str(default) or ...
     probe: dict[str, Any] = {name: (kind, ...)}
@@ -224,7 +224,7 @@ def _field(shown: str, name: str, kind: object, default: object) -> tuple[object
         create_model(name, **probe)
     except PydanticUserError:
         raise TypeError(
-            f"{shown} has the type {getattr(kind, '__name__', kind)}, which no key of a robot file can have; "
+            f"{shown} has the type {getattr(kind, '__name__', kind)}, but a key of a robot file cannot; "
             "write float, int, bool, str, Angle, Frequency ..."
         ) from None
     plain = get_args(kind)[0] if get_origin(kind) is Annotated else kind

@@ -47,7 +47,7 @@ PAUSED_CYCLE_NS = 200_000_000
 """Guardian's timeout of a cycle while the loop is paused. It is longer because a cycle may load a
 controller."""
 LONGEST_SHOWN = 120
-"""Number of characters after which a command's data are cut in its event."""
+"""Number of characters after which the text of a command is cut in its event."""
 
 
 class Play(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -57,6 +57,11 @@ class Play(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """
 
     parts: tuple[PlayedPart, ...]
+
+    @property
+    def words(self) -> str:
+        """The data as text for an event: `motion of head, left_arm`."""
+        return f"motion of {', '.join(dict.fromkeys(part.controller for part in self.parts))}"
 
 
 FORMS: Mapping[str, type[msgspec.Struct] | None] = {
@@ -342,9 +347,15 @@ class Steering:
             event = texts.command_refused(command.kind, command.origin, refusal.text)
         else:
             source = "loop"
-            shown = command.data.partition(b"\n")[0].decode(errors="replace")
-            if len(shown) > LONGEST_SHOWN:
-                shown = f"{shown[:LONGEST_SHOWN]} ..."  # the log of commands has all data
-            event = texts.loop_steered(f"{command.kind} {shown}".strip(), command.origin)
+            event = texts.loop_steered(_shown(command), command.origin)
         data = msgspec.json.encode(CommandOutcome(command.kind, command.origin, refusal, place))
         self._context.events.emit_event(source, event, data)
+
+
+def _shown(command: CommandMessage) -> str:
+    """Return an executed command for the loop as text, such as `rate 40 Hz`; the log has all its data."""
+    form = FORMS[command.kind]
+    request = None if form is None else msgspec.json.decode(command.data.partition(b"\n")[0], type=form)
+    words = request.name if isinstance(request, ControllerPlan) else getattr(request, "words", "")
+    shown = f"{command.kind} {words}".strip()
+    return shown if len(shown) <= LONGEST_SHOWN else f"{shown[:LONGEST_SHOWN]} ..."

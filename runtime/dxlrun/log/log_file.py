@@ -66,7 +66,7 @@ class LogFile:
     def write(self, data: bytes | bytearray | memoryview) -> int:
         """Write all of `data` and return its length. Raises OSError on a full disk or a truncated file."""
         if os.fstat(self._descriptor).st_size < self._size:
-            raise OSError(errno.EIO, "the file was cut by another program")
+            raise OSError(errno.EIO, "another program truncated the file")
         rest = memoryview(data)
         while rest:
             rest = rest[os.write(self._descriptor, rest) :]

@@ -219,8 +219,8 @@ class LogReader:
             raise LogError(f"{self.path}: no topic {topic}; {suggestion(topic, names)}")
         if known.encoding != "cdr" or known.schema_encoding != schemas.SCHEMA_ENCODING:
             raise LogError(
-                f"{self.path}: messages of {topic} are {known.encoding or 'nothing'}, defined in "
-                f"{known.schema_encoding or 'nothing'}; only cdr with ros2msg is read"
+                f"{self.path}: messages of {topic} are {known.encoding or 'nothing'} with schema "
+                f"{known.schema_encoding or 'none'}; dxlrun reads only cdr with ros2msg"
             )
         try:
             return ColumnReader(known.type)
@@ -288,7 +288,7 @@ def _readable(path: Path) -> Iterator[None]:
     except LogError:
         raise
     except ValueError as error:
-        raise LogError(f"{path}: a log that this version of dxlrun cannot read: {error}") from error
+        raise LogError(f"{path}: this version of dxlrun cannot read the log: {error}") from error
 
 
 def _header(path: Path, file: McapFile) -> LogHeader | None:
@@ -318,4 +318,4 @@ def _attached(data: bytes) -> dict[str, str]:
 
 
 def _foreign(path: Path) -> str:
-    return f"{path}: an MCAP file, but not written by dxlrun: it has no metadata '{schemas.METADATA_NAME}'"
+    return f"{path}: this MCAP file is not a log of dxlrun: it has no metadata '{schemas.METADATA_NAME}'"

@@ -39,8 +39,7 @@ _MEDIA_TYPES = {".json": "application/json", ".yaml": "application/yaml", ".txt"
 @event_text(EventCode.RECORDER_GAP, Severity.ERROR)
 def records_lost(source: str, lost: int) -> str:
     """Return the event that records of a source did not reach the log."""
-    what = counted(lost, f"record of {source} was", f"records of {source} were")
-    return f"{what} overwritten or damaged before the recorder read {'it' if lost == 1 else 'them'}"
+    return f"{counted(lost, 'record', 'records')} of {source} lost: overwritten or damaged before reading"
 
 
 class LogWriter(RunMessages):
@@ -199,7 +198,7 @@ class LogWriter(RunMessages):
             except OSError as error:
                 self._give_up(error)
         if self._file.gone:
-            self.error = "its file was deleted or moved by another program during the run"
+            self.error = "another program deleted or moved the file during the run"
         size = self._file.tell()
         self._file.close()
         self._summary = LogSummary(self._messages, size, self._lost, self.error, self._unwritten)

@@ -31,7 +31,7 @@ def log_files(path: Path) -> LogFiles:
     """
     if not path.is_dir():
         if path.exists() and not path.is_file():
-            raise LogError(f"{path}: a pipe or a device, not a file; a log is a file")
+            raise LogError(f"{path}: this is a pipe or a device; give a file")
         return LogFiles((path,))
     try:
         found = {
@@ -42,7 +42,7 @@ def log_files(path: Path) -> LogFiles:
     except OSError as error:
         raise LogError(f"{path}: cannot be read: {error.strerror or error}") from error
     if not found:
-        raise LogError(f"{path}: a directory without a log: it has no {part_name(0)}")
+        raise LogError(f"{path}: the directory has no log ({part_name(0)} not found)")
     numbers = sorted(found)
     missing = [missing_parts(before + 1, after) for before, after in pairwise(numbers) if after > before + 1]
     return LogFiles(tuple(found[number] for number in numbers), tuple(missing))

@@ -21,6 +21,6 @@ def read_recorded_packets(path: Path, bus: str) -> RecordedPackets:
     packets = PacketColumns.joined(pieces)
     asked = packets.kind == PacketKind.INSTRUCTION
     if not asked.any():
-        raise LogError(f"{path}: no instruction was sent on bus {bus}, so there is nothing to answer")
+        raise LogError(f"{path}: the log has no instruction for bus {bus}, so it cannot be simulated")
     data = packets.data.tobytes()
     return RecordedPackets(asked, packets.first_ns, packets.last_ns, packets.start, packets.length, data)

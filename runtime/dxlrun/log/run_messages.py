@@ -187,9 +187,7 @@ class RunMessages(ABC):
             case TopicRecord(t_ns, number, data=data) if number in self._topic_channels:
                 self._add(self._topic_channels[number], t_ns, data)
             case other:
-                raise ValueError(
-                    f"{type(other).__name__} does not belong in a log, or its topic was not opened"
-                )
+                raise ValueError(f"a log has no message {type(other).__name__}, or its topic is not open")
 
     def _taken_command(self, command: TakenCommand) -> None:
         data = self._command.pack(

@@ -92,7 +92,7 @@ class Codec:
         except struct.error as error:
             raise ValueError(f"{self.message.name}: {error}") from error
         if not isinstance(value, Mapping):
-            raise TypeError("a message is read as a mapping")
+            raise TypeError("a message must be a mapping")
         return value
 
 
@@ -193,12 +193,12 @@ def _row(value: Value, element: np.dtype[np.generic]) -> bytes | bytearray | mem
     """Return the bytes of a sequence of numbers; raise ValueError for another element type or shape."""
     if isinstance(value, np.ndarray):
         if value.dtype != element:
-            raise ValueError(f"{value.dtype} is given where {element} is asked")
+            raise ValueError(f"{value.dtype} given, {element} expected")
         if value.ndim != 1:
-            raise ValueError(f"an array of shape {value.shape} is given where one row is asked")
+            raise ValueError(f"an array of shape {value.shape} given, one row expected")
         return value.tobytes()
     if not isinstance(value, bytes | bytearray | memoryview) or element.itemsize != 1:
-        raise ValueError(f"numbers come as an array of {element}, not as {type(value).__name__}")
+        raise ValueError(f"{type(value).__name__} given, an array of {element} expected")
     return value
 
 
@@ -216,7 +216,7 @@ def _numbers(kind: str, fixed: int) -> tuple[Write, Read]:
             _align(buffer, 4)
             buffer += _LENGTH.pack(count)
         elif count != fixed:
-            raise ValueError(f"{count} numbers are given where {fixed} are asked")
+            raise ValueError(f"{count} numbers given, {fixed} expected")
         if row:
             _align(buffer, element.itemsize)
             buffer += row
@@ -240,7 +240,7 @@ def _numbers(kind: str, fixed: int) -> tuple[Write, Read]:
 def _text() -> tuple[Write, Read]:
     def write_text(buffer: bytearray, value: Value) -> None:
         if not isinstance(value, str):
-            raise ValueError(f"{type(value).__name__} is given where text is asked")
+            raise ValueError(f"{type(value).__name__} given, text expected")
         data = value.encode(errors="replace") + b"\0"
         _align(buffer, 4)
         buffer += _LENGTH.pack(len(data))
@@ -251,7 +251,7 @@ def _text() -> tuple[Write, Read]:
         (length,) = _LENGTH.unpack_from(data, at)
         at += 4
         if at + length > len(data) or not length:
-            raise ValueError("a text is longer than its message, or has no end")
+            raise ValueError("a text is longer than its message, or empty without its zero byte")
         return bytes(data[at : at + length - 1]).decode(errors="replace"), at + length
 
     return write_text, read_text
@@ -262,7 +262,7 @@ def _many(one: tuple[Write, Read]) -> tuple[Write, Read]:
 
     def write_sequence(buffer: bytearray, value: Value) -> None:
         if not isinstance(value, Sequence) or isinstance(value, str | bytes):
-            raise ValueError(f"{type(value).__name__} is given where a sequence is asked")
+            raise ValueError(f"{type(value).__name__} given, a sequence expected")
         _align(buffer, 4)
         buffer += _LENGTH.pack(len(value))
         for item in value:
@@ -327,7 +327,7 @@ def _field(field: MessageField, definitions: Definitions) -> tuple[Write, Read]:
         many = field.sequence or field.length
         return _numbers(field.kind, field.length) if many else _number(field.kind)
     if field.length:
-        raise ValueError(f"{field.name}: only numbers come in arrays of fixed length")
+        raise ValueError(f"{field.name}: an array of fixed length must contain numbers")
     if field.kind == "string":
         return _texts() if field.sequence else _text()
     one = _nested(field.kind, definitions)

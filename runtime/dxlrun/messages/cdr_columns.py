@@ -76,7 +76,7 @@ class FieldColumn:
         if self.values is not None:
             return self.values
         if self.counts is None or self.elements is None:
-            raise ValueError("a message has fields, of which one is to be named")
+            raise ValueError("a message with fields is not a value; name one of its fields")
         inside = self.elements.array()
         if len(self.counts) and (self.counts == self.counts[0]).all():
             return inside.reshape((len(self.counts), int(self.counts[0]), *inside.shape[1:]))

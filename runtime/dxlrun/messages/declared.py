@@ -98,7 +98,7 @@ class DeclaredMessage(msgspec.Struct, frozen=True):
         Raises WrongMessage, with one sentence that names the field, when a value does not fit.
         """
         if not isinstance(message, self.cls):
-            raise WrongMessage(f"takes {self.cls.__name__}, not {type(message).__name__}")
+            raise WrongMessage(f"{type(message).__name__} given, {self.cls.__name__} expected")
         try:
             values: Sequence[Value] = self._row(message)
             if self.stamped:
@@ -119,8 +119,8 @@ class DeclaredMessage(msgspec.Struct, frozen=True):
                 value = getattr(message, name)
                 self._codec.pack_field(name, value if plain is None else plain(value))
             except (ValueError, TypeError, AttributeError, OverflowError, struct.error) as error:
-                return f"takes no such {field}: {' '.join(str(error).split())}"
-        return f"takes no such {self.cls.__name__}"
+                return f"{field}: {' '.join(str(error).split())}"
+        return f"not a valid {self.cls.__name__}"
 
 
 def declared_message(cls: object, package: str) -> DeclaredMessage:
@@ -168,11 +168,13 @@ class _Annotations:
         if not (isinstance(cls, type) and _is_message(cls)):
             raise WrongMessage(f"{shown} is not a dataclass", "put @dataclass above the class of the message")
         if cls in inside or len(inside) >= _DEEPEST:
-            raise WrongMessage(f"{shown} contains itself", "a message of ROS 2 cannot: remove the field")
+            raise WrongMessage(
+                f"{shown} contains itself", "remove the field: a message of ROS 2 cannot be nested in itself"
+            )
         name = self._name(cls)
         short = short_name(name)
         if self._classes.setdefault(short, cls) is not cls:
-            raise WrongMessage(f"two classes are the message {name}", "give one of them another name")
+            raise WrongMessage(f"two classes have the message name {name}", "rename one of them")
         if short not in self.definitions:
             # The entry keeps the place before its dependencies.
             self.definitions[short] = ()
@@ -208,11 +210,11 @@ class _Annotations:
         if given is not None:
             if not isinstance(given, str) or not _ROS_TYPE.fullmatch(given):
                 what = f"{cls.__name__}.ros_type is {given!r}"
-                raise WrongMessage(what, 'a type of ROS 2 is written "std_msgs/msg/Header"')
+                raise WrongMessage(what, 'write a type of ROS 2, such as "std_msgs/msg/Header"')
             return given
         if not _CLASS.fullmatch(cls.__name__):
             raise WrongMessage(
-                f"{cls.__name__} is not a name of a message",
+                f"{cls.__name__} is not a valid name of a message",
                 "name the class like WaveState: letters and digits",
             )
         return f"{self._package}/msg/{cls.__name__}"
@@ -223,7 +225,7 @@ class _Annotations:
         field = f"{cls.__name__}.{name}"
         if not _NAME.fullmatch(name):
             raise WrongMessage(
-                f"{field} is not a name of a field", "ROS 2 takes lower case, digits, and single _"
+                f"{field} is not a valid name of a field", "write lower case, digits, and single _ for ROS 2"
             )
         found = self._kind(annotation, inside)
         if found is None:
@@ -301,7 +303,7 @@ def _nested(cls: type, known: Mapping[str, tuple[tuple[str, Plain | None], ...]]
 
     def plain(value: object) -> Value:
         if not isinstance(value, cls):
-            raise ValueError(f"{type(value).__name__} is given where {cls.__name__} is asked")
+            raise ValueError(f"{type(value).__name__} given, {cls.__name__} expected")
         # A tuple made from a list: one that grows from a generator ends in CPython's free list, which then
         # fills.
         return tuple(
@@ -317,7 +319,7 @@ def _nested(cls: type, known: Mapping[str, tuple[tuple[str, Plain | None], ...]]
 def _array(element: np.dtype[np.generic]) -> Plain:
     def plain(value: object) -> Value:
         if not isinstance(value, list | tuple):
-            raise ValueError(f"{type(value).__name__} is given where a tuple is asked")
+            raise ValueError(f"{type(value).__name__} given, a tuple expected")
         return np.array(value, dtype=element)
 
     return plain
@@ -326,7 +328,7 @@ def _array(element: np.dtype[np.generic]) -> Plain:
 def _each(convert: Plain) -> Plain:
     def plain(value: object) -> Value:
         if not isinstance(value, list | tuple):
-            raise ValueError(f"{type(value).__name__} is given where a tuple is asked")
+            raise ValueError(f"{type(value).__name__} given, a tuple expected")
         return [convert(one) for one in value]
 
     return plain

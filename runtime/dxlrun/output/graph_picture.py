@@ -84,8 +84,8 @@ def check_picture(path: Path) -> None:
     suffix = path.suffix.lower()
     if suffix not in _MARKS:
         raise InputError(
-            f"--graph {path}: the file's suffix must be {' or '.join(_MARKS)}; without a file --graph is the "
-            "last word, and draws in the terminal"
+            f"--graph {path}: the file's suffix must be {' or '.join(_MARKS)}; "
+            "to draw in the terminal, write --graph last, without a file"
         )
     check_target(path, _MARKS[suffix])
 

@@ -52,12 +52,12 @@ def check_target(target: Path, replaces: str | None = None) -> None:
         status = target.stat()
     except OSError as error:
         if os.path.lexists(target):
-            raise unwritable(target, "it is a link that leads nowhere") from None
+            raise unwritable(target, "it is a broken link") from None
         folder = target.parent
         if not isinstance(error, FileNotFoundError):
             raise unwritable(target, error) from None
         if not folder.is_dir():
-            raise unwritable(target, f"there is no directory {folder}") from None
+            raise unwritable(target, f"directory {folder} not found") from None
         if not os.access(folder, os.W_OK | os.X_OK):
             raise unwritable(target, f"the directory {folder} is read-only") from None
         return
@@ -67,7 +67,9 @@ def check_target(target: Path, replaces: str | None = None) -> None:
     if not os.access(target, os.W_OK):
         raise unwritable(target, "it is read-only")
     if status.st_size and not (replaces and _contains(target, replaces.encode())):
-        raise unwritable(target, "it exists" if replaces is None else "it exists, and is not from dxlrun")
+        raise unwritable(
+            target, "it exists" if replaces is None else "it exists and was not written by dxlrun"
+        )
 
 
 @contextmanager

@@ -94,8 +94,8 @@ class SimulationWait(msgspec.Struct, frozen=True):
             return ""
         times = counted(self.times, "time", "times")
         return (
-            f"the loop waited {times}, {self.waited_ns / 1e6:.0f} ms in all, because the process of "
-            "the simulated servos did not run"
+            f"the loop waited {times}, {self.waited_ns / 1e6:.0f} ms in all, for the process of the "
+            "simulated servos"
         )
 
 

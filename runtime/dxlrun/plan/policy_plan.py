@@ -12,8 +12,7 @@ from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
 
 Last = Literal["limp", "hold"]  # Final state of a robot: torque off, or torque on at its position
 TORQUE_STAYS = (
-    "torque stays on, as the policy says: the robot holds until its power is off; "
-    "the next run needs --take-over"
+    "torque stays on by the policy: the robot holds until its power is off; give --take-over to the next run"
 )
 """Remark at the end of a run with `hold`."""
 

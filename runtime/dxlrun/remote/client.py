@@ -105,13 +105,13 @@ def connect(robot: str | None = None, client: str | None = None) -> RemoteRobot:
     names = ", ".join(sorted(found))
     if robot is None:
         if not found:
-            raise DxlrunError("no robot runs that can be steered; start one (dxlrun ROBOT.yaml)")
+            raise DxlrunError("no running robot found; start one (dxlrun ROBOT.yaml)")
         if len(found) > 1:
             raise DxlrunError(f"several robots run: {names}; name one")
         robot = next(iter(found))
     if robot not in found:
         raise DxlrunError(
-            f"no robot {robot} runs that can be steered; " + (f"these do: {names}" if names else "start it")
+            f"robot {robot} is not running; " + (f"choose one of: {names}" if names else "start it")
         )
     return RemoteRobot(robot, SocketLink(found[robot], client))
 
@@ -171,9 +171,7 @@ class RemoteRobot:
 
             found = self._ask(requests.FRAMES)
             if found.urdf is None:
-                raise DxlrunError(
-                    f"{self.name} has no URDF; its robot file names one by `model: {{urdf: ...}}`"
-                )
+                raise DxlrunError(f"{self.name} has no URDF; write `model: {{urdf: ...}}` in the robot file")
             plan = msgspec.convert(found.frames, FramesPlan)
             self._frames = FrameTree(read_urdf(found.urdf), plan.moved, plan.imu, plan.imu_link)
         return self._frames
@@ -539,7 +537,9 @@ class RemoteRobot:
         try:
             return msgspec.json.decode(answer, type=kind, dec_hook=hook)
         except msgspec.MsgspecError as error:
-            raise DxlrunError(f"{self.name} answers in a way that this version does not know") from error
+            raise DxlrunError(
+                f"{self.name} sent an unknown reply; use the same version of dxlrun on both sides"
+            ) from error
 
     def _refused(self, status: int, answer: bytes) -> DxlrunError:
         """Return the exception for a refusal by the robot: Refused, or DxlrunError when the reply is not
@@ -548,7 +548,9 @@ class RemoteRobot:
         try:
             refused = msgspec.json.decode(answer, type=NotDone)
         except msgspec.MsgspecError:
-            return DxlrunError(f"{self.name} answers in a way that this version does not know")
+            return DxlrunError(
+                f"{self.name} sent an unknown reply; use the same version of dxlrun on both sides"
+            )
         sentence, wrong = refused.refused or f"HTTP status {status}", status in _WRONG_INPUT
         return Refused(sentence, code=refused.code, fields=refused.fields, wrong_input=wrong)
 
@@ -575,7 +577,7 @@ def _json(content: object) -> bytes:
         raise Refused(problem, code="invalid", fields={"problem": problem}, wrong_input=True) from error
     if len(body) > MOST_BYTES:
         raise Refused(
-            f"{len(body)} bytes are too many, at most {MOST_BYTES} are taken at once",
+            f"the request has {len(body)} bytes, more than {MOST_BYTES}; send less at once",
             code="too_long",
             fields={"size": len(body), "most": MOST_BYTES},
             wrong_input=True,
@@ -600,7 +602,7 @@ def _not_finite(content: object, where: str = "") -> tuple[str, float] | None:
 def _plain(value: object) -> object:
     lists = getattr(value, "tolist", None)
     if lists is None:
-        raise TypeError(f"{type(value).__name__} is not JSON")
+        raise TypeError(f"{type(value).__name__} cannot be written as JSON")
     return lists()
 
 

@@ -209,7 +209,7 @@ def _switch(name: str, running: RunSnapshot) -> str:
         if plan.active and plan.command and not set(plan.joints).isdisjoint(own.joints)
     ]
     leaving = f" --deactivate {' '.join(others)}" if others else ""
-    return f"`dxlrun switch --activate {name}{leaving}` activates it"
+    return f"activate it by `dxlrun switch --activate {name}{leaving}`"
 
 
 def _joined(
@@ -226,8 +226,8 @@ def _joined(
                 if sample is samples[0]:
                     problems.error(
                         sample.mark,
-                        "this part begins before the one before of its controller has ended",
-                        "start it later; one controller plays one part at a time",
+                        "this part begins before the end of the previous part of the same controller",
+                        "start it later",
                     )
                 return ()
             targets = {joint: _faster(target, speed) for joint, target in sample.targets.items()}
@@ -256,9 +256,9 @@ def _check(part: _ControllerSamples, running: RunSnapshot, problems: Problems) -
             continue
         problem, position = running.joints[joint].immovable, running.joint_position(joint)
         if problem and abs(target.position - position) > _STILL:
-            problems.error(target.mark, problem, "write a value above 0 there")
+            problems.error(target.mark, problem, "set the register above 0")
         elif not math.isfinite(position):
-            problems.error(target.mark, f"{joint} has not answered yet", "play the motion when it has")
+            problems.error(target.mark, f"{joint} has not answered yet", "wait for its first reply")
 
 
 def _refused(warning: Problem) -> Problem:

@@ -378,15 +378,15 @@ def _seconds(text: object) -> float:
 def _effort(value: object) -> object:
     if isinstance(value, str):
         raise ValueError(
-            f"{value!r} is text; write the number in what the model measures (Nm, A or the fraction of its "
-            "most), such as 0.1 for 100 mA"
+            f"{value!r} is text; write a number in the model's unit of effort (Nm, A or a fraction of the "
+            "maximum), such as 0.1 for 100 mA"
         )
     return value
 
 
 def _fraction(value: object) -> object:
     if isinstance(value, str):
-        raise ValueError(f"{value!r} is text; write the fraction of the full voltage, such as 0.2 for 20 %")
+        raise ValueError(f"{value!r} is text; write a fraction of the full voltage, such as 0.2 for 20 %")
     return value
 
 

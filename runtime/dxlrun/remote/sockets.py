@@ -76,14 +76,14 @@ def create_listener(robot: str) -> tuple[socket.socket, Path]:
         directory.mkdir(mode=0o700)
     if not owned(directory):
         raise DxlrunError(
-            f"{directory} must be a directory that only you may enter: remove it, or set XDG_RUNTIME_DIR"
+            f"{directory} is not a private directory of this user; remove it, or set XDG_RUNTIME_DIR"
         )
     with _locked(directory):
         path = directory / f"{robot}{SUFFIX}"
         if alive(path):
             path = directory / f"{robot}-{os.getpid()}{SUFFIX}"
         if len(os.fsencode(path)) > LONGEST_PATH:
-            raise DxlrunError(f"{path} is too long for a socket: give the robot a shorter name")
+            raise DxlrunError(f"{path} is too long for a socket; give the robot a shorter name")
         path.unlink(missing_ok=True)
         return _bound(path), path
 
@@ -300,7 +300,7 @@ def _connected(path: Path) -> socket.socket:
     except BlockingIOError:
         end.close()
         raise TimeoutError(
-            f"too many clients connect to it, and its queue was full for {TIMEOUT_S:g} s"
+            f"too many clients: the queue of connections was full for {TIMEOUT_S:g} s"
         ) from None
     except BaseException:
         end.close()
@@ -330,14 +330,14 @@ def _answer(end: socket.socket) -> tuple[int, bytes, bool]:
     data = b""
     while not (found := _HEAD.match(data)):
         if not (more := end.recv(_CHUNK)):
-            raise ConnectionResetError("the connection was closed without an answer")
+            raise ConnectionResetError("the connection was closed without a reply")
         data += more
         if not data.startswith(b"HTTP/1."[: len(data)]):
-            raise ValueError(f"{data[:40]!r} is not an answer of HTTP")
+            raise ValueError(f"{data[:40]!r} is not an HTTP reply")
     head, content = found[0].lower(), bytearray(data[found.end() :])
     length = _LENGTH.search(head)
     while length and len(content) < int(length[1]):
         if not (more := end.recv(_CHUNK)):
-            raise ConnectionResetError("the connection was closed in an answer")
+            raise ConnectionResetError("the connection was closed during a reply")
         content += more
     return int(found[1]), bytes(content), b"\r\nconnection: close" in head

@@ -39,13 +39,13 @@ def not_json(what: str, error: object) -> str:
     return f"{what} is not JSON: {error}"
 
 
-BODY_TOO_DEEP = "the body is nested too deeply; make it flatter"
+BODY_TOO_DEEP = "the body is nested too deeply; use fewer levels"
 NO_TOPIC = "name a topic, and a rate above 0 Hz; write for example /stream?topic=/joint_states"
-SEND_AS_COMMAND = "send it as a command"
+SEND_AS_COMMAND = "send the values as a command"
 
 
 def not_sendable(error: object) -> str:
-    return f"this cannot be sent: {error}; use numbers, texts, lists and mappings"
+    return f"the request cannot be sent: {error}; use numbers, texts, lists and mappings"
 
 
 def not_finite(place: str, value: object) -> str:
@@ -54,12 +54,12 @@ def not_finite(place: str, value: object) -> str:
 
 # Joints and registers
 
-NAME_JOINTS = "name one, a group, a controller, or all"
+NAME_JOINTS = "name joints, groups, controllers, or all"
 
 
 def no_reboot(servos: Sequence[str]) -> str:
-    verb = "knows" if len(servos) == 1 else "know"
-    return f"{', '.join(servos)} {verb} no reboot instruction: switch the torque off and on, or the power"
+    verb = "has" if len(servos) == 1 else "have"
+    return f"{', '.join(servos)} {verb} no reboot instruction; switch the torque or the power off and on"
 
 
 def no_register(model: str, item: str) -> str:
@@ -67,7 +67,7 @@ def no_register(model: str, item: str) -> str:
 
 
 def register_list(model: str) -> str:
-    return f"`dxlrun models {model}` lists them"
+    return f"list the registers by `dxlrun models {model}`"
 
 
 def wrong_value(joint: str, item: str, error: object) -> str:
@@ -75,7 +75,7 @@ def wrong_value(joint: str, item: str, error: object) -> str:
 
 
 def not_a_servo(name: str) -> str:
-    return f"it is not a servo: `dxlrun get {name}` prints its states"
+    return f"{name} is not a servo; print its states by `dxlrun get {name}`"
 
 
 def several_models(joint: str, models: Collection[str], servos: Collection[str]) -> str:
@@ -84,7 +84,7 @@ def several_models(joint: str, models: Collection[str], servos: Collection[str])
 
 
 def joint_cannot_move(immovable: str) -> str:
-    return f"{immovable}; write a value above 0 there"
+    return f"{immovable}; set the register above 0"
 
 
 # Commands by the names of joints
@@ -95,11 +95,11 @@ def no_joint_named(controller: str, kind: str, joint: str) -> str:
 
 
 def takes_no_time(controller: str) -> str:
-    return f"{controller} moves its joints at once, so it takes no time; omit the time"
+    return f"{controller} moves its joints immediately; omit the time"
 
 
 def has_own_times(controller: str, kind: str) -> str:
-    return f"in is for joints by name, and {kind} of {controller} has its own times; omit in"
+    return f"{kind} of {controller} contains its own times; omit in="
 
 
 def value_not_finite(controller: str, kind: str, joint: str, value: object) -> str:
@@ -107,11 +107,11 @@ def value_not_finite(controller: str, kind: str, joint: str, value: object) -> s
 
 
 def quantities_of_joints(controller: str, quantities: Sequence[str]) -> str:
-    return f"joints of {controller} take {', '.join(quantities) or 'nothing by name'}"
+    return f"{controller} accepts for each joint: {', '.join(quantities) or 'no values by name'}"
 
 
 def value_not_known(joint: str, quantity: str) -> str:
-    return f"the {quantity} of {joint} are not known yet; name it in the command too"
+    return f"the {quantity} of {joint} are not known yet; add {joint} to the command"
 
 
 # Commands of devices
@@ -122,7 +122,7 @@ def source_without_commands(source: str) -> str:
 
 
 def no_command_named(source: str, commands: Collection[str]) -> str:
-    return f"no command of {source} is named; name one of {', '.join(commands)}"
+    return f"the request names no command of {source}; name one of {', '.join(commands)}"
 
 
 def source_value_not_a_number(source: str, command: str, value: object) -> str:
@@ -135,7 +135,7 @@ def outside(value: float, lowest: float, highest: float) -> str:
 
 def several_commanders(commands: Collection[str], controllers: Collection[str]) -> str:
     by = ", ".join(sorted(controllers))
-    return f"{', '.join(commands)} are commanded by {by}: send one at a time"
+    return f"{', '.join(commands)} are commanded by {by}; send one command at a time"
 
 
 def not_commandable(command: str, commander: str, able: str) -> str:
@@ -147,7 +147,7 @@ def not_commandable(command: str, commander: str, able: str) -> str:
         able: Controller that would take values; empty: none.
     """
     by = (
-        f"commanded by {commander}, which takes no values for it"
+        f"commanded by {commander}, but not by values from clients"
         if commander
         else "commanded by no controller"
     )
@@ -155,18 +155,18 @@ def not_commandable(command: str, commander: str, able: str) -> str:
         fix = f"`dxlrun switch --activate {able}{f' --deactivate {commander}' if commander else ''}`"
     else:
         entry = f"NAME: {{type: device_command_controller, commands: [{command}]}}"
-        fix = f"write into the robot file, under controllers, {entry}"
+        fix = f"add to `controllers` in the robot file: {entry}"
     return f"{command} is {by}; {fix}"
 
 
 # Controllers and parameters
 
 NO_PARAMETER = 'nothing to change; write for example {"values": {"speed": "20 deg/s"}}'
-OTHER_NAME = "choose another name, or unload it"
+OTHER_NAME = "choose another name, or unload that controller"
 
 
 def type_missing(controller: str, kind: str) -> str:
-    return f"no plug-in offers the type {kind} of {controller} any more"
+    return f"the plug-in with the type {kind} of {controller} is missing; install it again"
 
 
 def name_too_long(longest: int) -> str:
@@ -178,7 +178,7 @@ def active_at_once(controller: str) -> str:
 
 
 def parameter_parts(parts: Sequence[str]) -> str:
-    return f"name its parts: {', '.join(parts)}"
+    return f"name one of its values: {', '.join(parts)}"
 
 
 def live_parameters(names: Sequence[str]) -> str:
@@ -186,4 +186,4 @@ def live_parameters(names: Sequence[str]) -> str:
 
 
 def parameter_not_a_number(name: str, value: object) -> str:
-    return f"{name} = {value!r} is neither a number nor a bool, so it cannot change in a run"
+    return f"{name} = {value!r} cannot change in a run; only numbers and bools can"

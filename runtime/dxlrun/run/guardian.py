@@ -416,11 +416,7 @@ class Guardian:
 
     def _report_unsupervised(self) -> None:
         """Log that the supervisor is dead or stopped, so that nobody else can end the run."""
-        what = (
-            "left the run"
-            if self._control.closed
-            else "was stopped, as by Ctrl-Z, and could not end the run any more"
-        )
+        what = "left the run" if self._control.closed else "was suspended (such as by Ctrl-Z)"
         self._unsupervised = (
             f"the supervisor (process {self._job.supervisor}) {what}; the loop was asked to stop"
         )
@@ -444,20 +440,20 @@ class Guardian:
         where = f" in {called}" if called else ""
         if self._killed == "hung":
             if self._halted:
-                return f"the loop was stopped by a signal{where} and was killed"
+                return f"the loop was suspended by a signal{where} and was killed"
             still = _duration(self._timeout_ns())
-            return f"the loop stood still for more than {still}{where} and was killed{self._starved()}"
+            return f"the loop did not respond for more than {still}{where} and was killed{self._starved()}"
         if self._killed == "late":
             limit = _duration(self._job.plan.exit_timeout_ns)
             return f"the loop did not stop within {limit}{where} and was killed"
-        return f"the loop's process ended unexpectedly ({_manner(loop.returncode)}){where}"
+        return f"the loop's process exited unexpectedly ({_manner(loop.returncode)}){where}"
 
     def _starved(self) -> str:
         """Return a clause about a loop that was ready to run but got no processor; empty when not known."""
         if self._starved_ns is None:
             return ""
-        got = f"; it was ready to run, but got a processor for only {self._starved_ns / 1e6:.1f} ms of that"
-        fix = "; loop.scheduler.policy round_robin lets it run before other programs"
+        got = f"; it was ready to run but received only {self._starved_ns / 1e6:.1f} ms of processor time"
+        fix = "; write loop.scheduler.policy: round_robin to run it before other programs"
         return got if self._job.plan.priority else got + fix
 
 

@@ -123,12 +123,12 @@ def _read(path: Path) -> KeptFile:
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
         with open(descriptor, "rb") as file:
             if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-                return KeptFile(str(path), problem="its file is not a regular file")
+                return KeptFile(str(path), problem="the state's path is not a regular file")
             state, made_with = opened_file(file.read(LONGEST_FILE + 1), path.stem)
     except OSError as error:
-        return KeptFile(str(path), problem=f"its file cannot be read: {error.strerror or error}")
+        return KeptFile(str(path), problem=f"the state's file cannot be read: {error.strerror or error}")
     except ValueError as error:
-        return KeptFile(str(path), problem=f"its file {error}")
+        return KeptFile(str(path), problem=f"the state's file {error}")
     return KeptFile(str(path), state, made_with)
 
 
@@ -161,12 +161,12 @@ class KeptFiles:
         try:
             opened_file(data, controller)
             if self._directory is None:
-                raise OSError("there is no home directory")
+                raise OSError("this user has no home directory")
             replace_file(self._directory, f"{controller}{SUFFIX}", data)
         except OSError as error:
             self.problems[controller] = f"{error.strerror or error}"
         except ValueError as error:
-            self.problems[controller] = f"the state that came from the loop {error}"
+            self.problems[controller] = f"the state from the loop {error}"
         else:
             self.problems.pop(controller, None)
 
@@ -175,10 +175,10 @@ class KeptFiles:
         """Sentences for the user about states that were not written, at the end of the run."""
         problems = dict(self.problems)
         for controller in self._assembly.unfinished if self._assembly else ():
-            problems[controller] = "the loop ended while it left"
+            problems[controller] = "the loop ended before it was complete"
         where = self._directory or "~/.local/state"
         return tuple(
-            f"what {controller} learned last is not kept in {where}: {why}"
+            f"the last state of {controller} was not saved in {where}: {why}"
             for controller, why in problems.items()
         )
 
@@ -242,5 +242,5 @@ class KeptStateWriter(threading.Thread):
         self._ended.set()
         self.join(_WRITING_TIMEOUT_S)
         if self.is_alive():
-            return ("the disk is too slow for what controllers learned; it is not kept",)
+            return ("the disk is too slow: the last states of controllers were not saved",)
         return self._files.sentences

@@ -114,9 +114,8 @@ def _looked_at(heartbeat: Heartbeat) -> Callable[[str], None]:
         if more > 0:
             raise PlugInError(
                 f"plug-in {name} started {counted(more, 'more thread', 'more threads')} in the loop's "
-                "process; "
-                "CPython would hand the interpreter over to them in the middle of a cycle: "
-                "let it work in on_configure without threads, or in a process of its own"
+                "process, and threads delay the loop's cycles; work in on_configure without threads, or "
+                "start a separate process"
             )
 
     return check_import
@@ -349,7 +348,7 @@ def main() -> None:
         events.emit_event("loop", texts.start_refused(error.sentences))
     # Last resort: the run ends with a sentence, and the log has the traceback.
     except Exception as error:
-        sentence = f"dxlrun itself failed: {type(error).__name__}: {error}; --debug shows where"
+        sentence = f"dxlrun itself failed: {type(error).__name__}: {error}; run with --debug for details"
         outcome = LoopOutcome("fault", sentences=(sentence,), traceback=traceback.format_exc())
         sys.stderr.write(outcome.traceback)
         events.emit_event("loop", texts.loop_crashed(outcome.traceback))

@@ -210,15 +210,15 @@ def diagnose(machine: Machine) -> tuple[CheckResult, ...]:
 
 
 def _system(machine: Machine) -> CheckResult:
-    check = _Check("system", "a run is several processes that share nameless memory and watch each other")
+    check = _Check("system", "a run is several processes with shared memory and pidfds, which need Linux")
     if not machine.platform.startswith("linux"):
         return check.missing(
             f"this is {machine.platform}; robots run on Linux only, files can be checked everywhere",
-            "run the robot from a Linux machine, which may be a small one",
+            "run the robot on a Linux machine, such as a Raspberry Pi",
         )
     if machine.missing_calls:
         return check.missing(
-            f"this Python has no {', '.join(machine.missing_calls)}", "install Linux 5.3 or newer"
+            f"this Python lacks {', '.join(machine.missing_calls)}", "install Linux 5.3 or newer"
         )
     return check.good(f"Linux {machine.read_text('proc/sys/kernel/osrelease') or 'of an unknown version'}")
 
@@ -258,15 +258,16 @@ def _ports(machine: Machine) -> Iterator[CheckResult]:
 def _rates(machine: Machine, path: Path) -> Iterator[CheckResult]:
     """Check the rates that a port's driver sets; yields nothing for a port that cannot be opened now."""
     name = machine.format_path(path)
-    check = _Check(f"baud rates of {name}", "servos do not receive what is sent at another rate than theirs")
+    check = _Check(f"baud rates of {name}", "a servo receives only packets at its own baud rate")
     found = machine.set_rates(path)
     wrong = {rate: real for rate, real in found.items() if not is_rate(real, rate)}
     if wrong:
         shown = ", ".join(f"{rate} becomes {real}" for rate, real in wrong.items())
-        right = ", ".join(str(rate) for rate in found if rate not in wrong) or "none of the others"
-        yield check.worse(f"its driver does not have all rates: {shown} bit/s", f"choose a rate of: {right}")
+        right = ", ".join(str(rate) for rate in found if rate not in wrong)
+        fix = f"choose a rate of: {right}" if right else "use another adapter"
+        yield check.worse(f"its driver changes rates: {shown} bit/s", fix)
     elif found:
-        yield check.good(f"{', '.join(map(str, found))} bit/s are set as asked")
+        yield check.good(f"{', '.join(map(str, found))} bit/s are set exactly")
 
 
 def _port(machine: Machine, path: Path) -> CheckResult:
@@ -285,14 +286,14 @@ def _timer(machine: Machine, path: Path) -> CheckResult:
     """Check the latency timer of an FTDI adapter; other adapters have none."""
     check = _Check(
         f"latency timer of {path.parent.name}",
-        "the adapter keeps the last bytes of each reply back for so long",
+        "the adapter delays the last bytes of each reply by this time",
     )
     found, shown = timer_ms(path), machine.format_path(path)
     if found is None:
         return check.worse("it cannot be read", f"cat {shown}")
     if found <= FAST_MS:
         return check.good(f"{found} ms")
-    return check.worse(f"{found} ms where 1 ms is possible", fix(shown))
+    return check.worse(f"{found} ms, 1 ms is possible", fix(shown))
 
 
 def _priority(machine: Machine) -> CheckResult:
@@ -306,7 +307,7 @@ def _priority(machine: Machine) -> CheckResult:
         return check.worse(found, _raise_limit(machine, "rtprio", 98))
     if not machine.may_schedule():
         return check.worse(
-            "it is allowed, but the kernel refuses it: this group of processes has no real-time share",
+            "allowed, but refused by the kernel: this control group has no real-time share",
             _CONTAINER if machine.container else _DEFAULT_SHARE,
         )
     return check.good(f"up to {highest}, {_by(machine, 'CAP_SYS_NICE', 'rtprio')}")
@@ -354,14 +355,14 @@ def _preemption(machine: Machine) -> tuple[CheckResult, ...]:
         return ()
     check = _Check(
         "preemption",
-        "with preempt=none or voluntary, another program's system call (writing 1 MiB takes 2 ms) keeps a "
-        "loop of any priority waiting until it ends",
+        "with preempt=none or voluntary, the loop waits for system calls of other programs, whatever its "
+        "priority (writing 1 MiB takes 2 ms)",
     )
     # With lazy, only ordinary programs are preempted later (kernel/Kconfig.preempt).
     if model in {"full", "lazy"}:
         return (check.good(f"preempt={model}"),)
     where = "of the machine that runs this container " if machine.container else ""
-    fix = f"add preempt=full to the kernel's command line {where}and start it again"
+    fix = f"add preempt=full to the kernel's command line {where}and reboot"
     return (check.worse(f"preempt={model}", fix),)
 
 
@@ -409,7 +410,7 @@ def _real_time_share(machine: Machine) -> CheckResult:
     """Check that a runaway real-time loop leaves a share of its core to other programs (sched(7))."""
     check = _Check(
         "real-time share",
-        "a real-time loop that never sleeps would lock out everything else on its core, also you",
+        "a real-time loop that never sleeps would block all other programs on its core, also your shell",
     )
     share = machine.read_text(_SHARE)
     if share == "-1":
@@ -424,8 +425,8 @@ def _clock_source(machine: Machine) -> CheckResult:
     source = machine.read_text(_CLOCK_SOURCE)
     if source in _SLOW_CLOCKS:
         return check.worse(
-            f"the clock source is {source}, which is slow to read",
-            "add clocksource=tsc to the kernel's command line and start again",
+            f"the clock source is {source}, slow to read",
+            "add clocksource=tsc to the kernel's command line and reboot",
         )
     return check.good(f"the clock source is {source or 'not shown'}")
 
@@ -435,25 +436,24 @@ def _cores(machine: Machine) -> CheckResult:
     check = _Check("cores", "guardian, recorder and gateway work next to the loop")
     if machine.cores < 2:
         return check.worse(
-            "there is one core for all processes", "use a machine, or allow this process, two cores or more"
+            "one core for all processes",
+            "use a machine with two cores or more, or allow them to this process",
         )
     isolated = machine.read_text("sys/devices/system/cpu/isolated")
-    also = f"; isolated: {isolated}, give them to the loop by loop.scheduler.cores" if isolated else ""
+    also = f"; isolated: {isolated} (write them in loop.scheduler.cores for the loop)" if isolated else ""
     return check.good(f"{machine.cores} cores{also}")
 
 
 def _governor(machine: Machine) -> CheckResult:
     """Check that the cores always run at their full clock rate."""
-    check = _Check(
-        "CPU governor", "a core that has to speed up first makes the first milliseconds of work slow"
-    )
+    check = _Check("CPU governor", "a core at a low clock rate makes the first milliseconds of work slow")
     found = sorted({path.read_text().strip() for path in machine.glob(_GOVERNORS)})
     if not found:
-        return check.good("this machine has none, or hides it")
+        return check.good("this machine has no governor, or does not show it")
     if found == ["performance"]:
         return check.good("performance on all cores")
     return check.worse(
-        f"{', '.join(found)} where performance is meant",
+        f"{', '.join(found)} instead of performance",
         f"echo performance | sudo tee /{_GOVERNORS.replace('[0-9]', '')}",
     )
 
@@ -467,7 +467,7 @@ def _idle_latency(machine: Machine) -> CheckResult:
     )
     device = machine.root / IDLE_LATENCY.relative_to("/")
     if not device.exists():
-        return check.good("this machine has no such states, or hides them")
+        return check.good("this machine has no idle states, or does not show them")
     if machine.may_write(device):
         return check.good("runs may keep cores awake")
     return check.worse("runs may not keep cores awake", allow_idle_latency(machine.user))

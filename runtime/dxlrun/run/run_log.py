@@ -96,7 +96,7 @@ def new_log(recording: RecordingPlan, robot: str) -> Path:
         directory = directory.expanduser()
         directory.mkdir(parents=True, exist_ok=True)
     except RuntimeError as error:
-        raise InputError(f"the log's directory {directory}: {error}; write its whole path") from error
+        raise InputError(f"the log's directory {directory}: {error}; write its absolute path") from error
     except OSError as error:
         raise InputError(
             f"the log's directory {directory} cannot be made: {error.strerror or error}; write another under "

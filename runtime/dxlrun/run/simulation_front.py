@@ -203,7 +203,7 @@ class _Front:
             if self._typed in ready and self._typed is not None:
                 self._type(self._typed)
             self._listen()
-        self.sentences.append("the simulated bus ended in the middle")
+        self.sentences.append("the simulated bus exited unexpectedly")
 
     def _sources(self) -> list[Messages | socket.socket | TypedLines]:
         sources: list[Messages | socket.socket | TypedLines] = [self._child.channel, self._stop]

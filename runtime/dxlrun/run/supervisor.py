@@ -125,7 +125,7 @@ class _SourceProcess:
             how = f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
             slots = self.memory.slots[self.planned.feature.name]
             writer = SlotWriter(mapped(slots[self.planned.index]))
-            writer.write_state(SlotState.ENDED, f"its process ended ({how}), another one is started")
+            writer.write_state(SlotState.ENDED, f"its process exited ({how}) and is restarted")
 
     def end_process(self) -> None:
         """Give the process time to close its device, then kill it."""
@@ -277,7 +277,7 @@ class _Run:
             if message:
                 self._handle_message(message, guardian.channel.descriptors)
             elif duty is not Duty.NONE and not guardian.channel.closed:
-                self.sentences.append("the guardian stopped watching the loop, and was killed")
+                self.sentences.append("the guardian stopped watching the loop and was killed")
                 guardian.kill()
                 break
 
@@ -296,7 +296,7 @@ class _Run:
     def _look_after_simulation(self, guardian: Child[GuardianMessage]) -> None:
         """Stop the run after the simulated servos have exited: unlike an adapter, they do not come back."""
         if self.simulation and self.simulation.process.poll() is not None:
-            self.sentences.append("the simulated bus ended before the run did")
+            self.sentences.append("the simulated bus exited before the end of the run")
             self.simulation.end_process()
             self.simulation = None
             guardian.channel.send_message(Stop())
@@ -346,8 +346,10 @@ class _Run:
         """Report that the run can no longer be steered, and end a run that waits for the gateway."""
         self.steerable = False
         if self.held and self.guardian is not None:
-            fix = "without --listen it would" if self.options.listen else "--no-gateway runs without"
-            self.sentences.append(f"the gateway {what}, so the robot did not move; {fix}")
+            option = "omit --listen" if self.options.listen else "give --no-gateway"
+            self.sentences.append(
+                f"the gateway {what}, so the robot did not move; {option} to run without the gateway"
+            )
             self.guardian.channel.send_message(Stop())
         else:
             self.remarks.append(f"the gateway {what}: the run continues, but cannot be steered")
@@ -379,14 +381,14 @@ class _Run:
                 select.select([loop], [], [])
                 break
         phase = Heartbeat(self.memory.heartbeat).phase
-        self.sentences.append("the guardian ended in the middle of the run")
+        self.sentences.append("the guardian exited during the run")
         cut = self.signals > 1
         if phase is Phase.DONE and not cut:
-            self.sentences.append("the loop stopped and left the robot as its policy demands")
+            self.sentences.append("the loop ended normally by its policy")
         elif phase is not Phase.LOADING:
             called = Heartbeat(self.memory.heartbeat).activity
             where = f" in {called}" if called else ""
-            how = f"the loop ended too{where}" if gone else f"the loop did not stop{where} and was killed"
+            how = f"the loop exited too{where}" if gone else f"the loop did not stop{where} and was killed"
             safe_stop = SafeStop(job)
             leave = safe_stop.limp if cut else safe_stop.apply_final_state
             self.sentences += leave(guardian.channel.descriptors, how, texts.loop_failed)
@@ -431,7 +433,7 @@ class _Run:
                     self.messages = message.summary.messages
                     if gaps := message.summary.gaps:
                         self.sentences.append(
-                            f"the log lacks {counted(gaps, 'record', 'records')}, and declares that: "
+                            f"{counted(gaps, 'record is', 'records are')} missing in the log: "
                             "the recorder was too slow"
                         )
             recorder.end_process()
@@ -440,7 +442,9 @@ class _Run:
             recorder.kill()
         if not closed:
             last = CycleSpan.load(self.memory.span).last_cycle_text
-            self.sentences.append(f"the recorder ended before the run did; {self.log} can be read: {last}")
+            self.sentences.append(
+                f"the recorder exited before the end of the run; {self.log} can be read: {last}"
+            )
 
 
 def run_robot(plan: Plan, options: RunOptions, out: Console) -> RunSummary:

@@ -26,7 +26,7 @@ def line_problem(problem: str) -> str:
 
 @event_text(EventCode.GUARDIAN, Severity.ERROR)
 def line_gone() -> str:
-    return "a line is lost and will not be opened again"
+    return "a port is lost and will not be opened again"
 
 
 @event_text(EventCode.GUARDIAN, Severity.ERROR)

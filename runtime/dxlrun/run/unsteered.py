@@ -67,11 +67,11 @@ def unsteered_runs() -> list[UnsteeredRun]:
 def describe_run(run: UnsteeredRun) -> str:
     """Return a sentence for a person who tries to steer the run."""
     if run.problem:
-        fix = f"`dxlrun stop --robot {run.name}` ends it"
+        fix = f"end it by `dxlrun stop --robot {run.name}`"
         return f"{run.name} runs but cannot be steered: {run.problem}; {fix}"
     if _is_ending(run.run):
         return f"{run.name} is ending"
-    return f"{run.name} is starting and cannot be steered yet; try again when it runs"
+    return f"{run.name} is starting; try again when it runs"
 
 
 def end_run(unsteered: UnsteeredRun, *, wait: bool) -> str:
@@ -158,7 +158,7 @@ def _not_ended(name: str, left: list[RunProcess]) -> str:
     names = " and ".join(map(str, left))
     pids = " ".join(str(one.pid) for one in left)
     return (
-        f"{name}: {names} did not end within {_END_S:g} s, so torque may be on; "
+        f"{name}: {names} did not end within {_END_S:g} s and torque may be on; "
         f"switch the servos' power off, then `kill -9 {pids}`"
     )
 

@@ -232,7 +232,7 @@ def require_simulated(plan: Plan) -> None:
     real = [bus.name for bus in plan.buses if bus.port != "sim"]
     if real:
         raise InputError(
-            f"virtual time needs simulated servos, but bus {', '.join(real)} has a real port: "
+            f"--virtual needs simulated servos, and bus {', '.join(real)} has a real port; "
             "give the argument port:=sim"
         )
     for feature, stage in stages(ProcessStage, plan.features):

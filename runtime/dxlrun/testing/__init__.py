@@ -85,9 +85,7 @@ def kinematics(robot: str | Path, *, arguments: Mapping[str, str] | None = None)
     """
     plan = plan_of(robot, arguments=arguments)
     if plan.urdf is None or plan.frames is None:
-        raise InputError(
-            f"{robot} names no URDF, so nothing is known of its frames; write `model: {{urdf: ...}}`"
-        )
+        raise InputError(f"{robot} has no URDF and so no frames; write `model: {{urdf: ...}}`")
     return FrameTree.from_urdf(plan.urdf, plan.frames)
 
 

@@ -190,7 +190,7 @@ class VirtualLink:
 
     def stream(self, path: str) -> tuple[int, bytes, socket.socket]:
         """Raise OSError. Streams are not supported, because messages would arrive only during a request."""
-        raise OSError("a run on virtual time has no streams; its log has every message")
+        raise OSError("a run on virtual time has no streams; read the messages from its log")
 
     @property
     def alive(self) -> bool:

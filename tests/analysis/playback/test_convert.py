@@ -140,7 +140,7 @@ def _only(line: str, joint: str, *, speed: bool) -> str:
     ("words", "said"),
     [
         (["a.mcap"], "a.mcap does not end in .yaml; give the name of a YAML file"),
-        (["none/a.yaml"], "there is no directory none"),
+        (["none/a.yaml"], "directory none not found"),
         (["a.yaml", "--joint", "pan"], "a motion file needs all joints of both; convert tilt too"),
         (
             ["a.yaml", "--joint", "pan", "--map", "pan=arm"],

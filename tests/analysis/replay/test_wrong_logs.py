@@ -161,6 +161,6 @@ def test_a_log_that_ends_by_a_kill(tmp_path: Path, pair_log: Path) -> None:
     report = replay_log(log)
     assert (report.compared, report.same) == (50, True)
     assert report.remarks == (
-        "the file has no end: its recorder was killed, or could write no more; its last cycle is at 1.0 s of "
+        "the file ends early: the recorder was killed or could not write; its last cycle is at 1.0 s of "
         "the run",
     )

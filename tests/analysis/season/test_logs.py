@@ -112,7 +112,7 @@ def test_rows_are_what_the_analysis_of_each_log_has(season: Path, here: Here, dx
 
     assert list(found) == NAMES
     broken = found.pop("may/broken.mcap")
-    assert broken["unreadable"] == "this is not an MCAP file, and a log of dxlrun is one"
+    assert broken["unreadable"] == "this is not an MCAP file; give a log of dxlrun"
     assert (broken["robot"], broken["bytes"]) == (None, 13)
     for name, row in found.items():
         report = analyze_log(season / name)
@@ -278,7 +278,7 @@ def test_a_wrong_question_is_one_sentence_and_reads_or_writes_nothing(
         ("empty", "no logs (.mcap) found"),
         (
             "no duckdb",
-            "duckdb and pyarrow, which are not installed; `pip install 'dxlrun[logs]'` installs them",
+            "duckdb and pyarrow (not installed); install it: `pip install 'dxlrun[logs]'`",
         ),
         ("no cache", "set XDG_CACHE_HOME to another directory"),
     ],

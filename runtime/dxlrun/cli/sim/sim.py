@@ -189,7 +189,7 @@ def _simulated(
     options = {"--servo": servo or None, "--baud": baud, "--protocol": protocol}
     given = [name for name, value in options.items() if value is not None]
     if servo and not robot.is_file():
-        raise InputError(f"{robot} is not a robot file; if it is a servo, give it a --servo of its own")
+        raise InputError(f"{robot} is not a robot file; give each servo by --servo, such as --servo {robot}")
     if given:
         raise InputError(f"{' and '.join(given)} and a robot file exclude each other; omit one of them")
     result = compiled(robot, assignments, (), None)
@@ -220,7 +220,7 @@ def _recorded(log: Path, others: Sequence[str]) -> _SimulationSetup:
     if others:
         raise InputError(f"--recorded and {' and '.join(others)} exclude each other; omit one of them")
     if not log.exists():
-        raise InputError(f"there is no log {log}; a run prints the path of its log when it ends")
+        raise InputError(f"log {log} not found; give the path that the run printed")
     from dxlrun.log.log_reader import open_log
     from dxlrun.plan.robot_plan import from_json
     from dxlsim.simulation_plan import BusConfig, SimulationConfig
@@ -229,7 +229,7 @@ def _recorded(log: Path, others: Sequence[str]) -> _SimulationSetup:
     try:
         plan = from_json(reader.attachments["plan.json"])
     except (KeyError, ValueError) as error:
-        raise InputError(f"{log}: the plan of its run cannot be read, so its buses are not known") from error
+        raise InputError(f"{log}: the plan of the run cannot be read; give another log") from error
     path = str(log.absolute())
     buses = tuple(BusConfig(bus.name, bus.baud_rate, (), bus.protocol, recorded=path) for bus in plan.buses)
     hint = "dxlrun ROBOT.yaml" if len(buses) == 1 else None
@@ -273,9 +273,9 @@ def link_of_each(buses: Sequence[BusConfig], link: Path | None) -> dict[str, Pat
     links = {name: link if len(names) == 1 else link.with_name(f"{link.name}.{name}") for name in names}
     wrong = []
     if not link.parent.is_dir():
-        wrong.append(f"--link {link}: there is no directory {link.parent}; make it first")
+        wrong.append(f"--link {link}: directory {link.parent} not found; make it first")
     wrong += [
-        f"--link {path} exists and is not a link; it is not replaced, choose another --link"
+        f"--link {path} exists and is not a link; choose another --link"
         for path in links.values()
         if path.exists() and not path.is_symlink()
     ]

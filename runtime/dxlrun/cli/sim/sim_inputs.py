@@ -102,7 +102,7 @@ def _faults_of(file: Path) -> tuple[list[Fault], list[Problem]]:
     try:
         text = read_file(file).decode("utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "it is not text"
+        reason = error.strerror if isinstance(error, OSError) else "not text"
         raise InputError(f"the faults in {file} cannot be read ({reason}); give a text file") from None
     faults: list[Fault] = []
     problems: list[Problem] = []

@@ -262,7 +262,7 @@ def page(look: SimulationMessage, typed: str | None, width: int, height: int, *,
     table = servo_table(servos[:room], several=several)
     parts = [Text.assemble(*line) for line in (fitted(table, width) if table.rows else ())]
     if len(servos) > room:
-        parts.append(Text(f"... and {len(servos) - room} more; a higher window shows them", style="dim"))
+        parts.append(Text(f"... and {len(servos) - room} more; enlarge the window to see them", style="dim"))
     if look.lateness_us:
         late = ", ".join(f"{name} {value:.0f} us" for name, value in look.lateness_us.items())
         parts.append(Text(f"replies later than planned: {late}", style="dim"))

@@ -93,7 +93,7 @@ def send(
             return report_done(robot, chosen, done, f"{robot.name}: {controller} accepted {what}{as_goal}")
         if done.goal is None:
             raise DxlrunError(
-                f"{controller} accepted {kind}, but it is not a goal, so nothing can be awaited"
+                f"{controller} accepted {kind}, but this command has no end to wait for; omit --wait"
             )
         return show_goal_progress(robot, chosen, done, [done.goal.number])
 

@@ -81,7 +81,7 @@ def reboot(*joints: Joints, release: Flag = False, chosen: RobotChoice = ONLY_ON
     names = _named(joints)
     with connect_robot(chosen.robot, "reboot") as robot:
         done = robot.reboot(names, release=release)
-        text = f"{', '.join(names)} rebooted, and ready again{_others(done)}"
+        text = f"{', '.join(names)} rebooted and ready again{_others(done)}"
         return report_done(robot, chosen, done, f"{robot.name}: {text}")
 
 
@@ -177,7 +177,7 @@ def source_facts(found: Mapping[str, Any]) -> list[tuple[str, str]]:
             (found["commands"], found.get("command_units", {})),
         )
     )
-    age = format_number(found["age"], "ms") or "none came yet"
+    age = format_number(found["age"], "ms") or "no states yet"
     of_states = [*states, ("age", age if found["valid"] else f"{age}, not valid")] if states else []
     return [*of_states, *((f"{name}, commanded", value) for name, value in commands)]
 
@@ -220,13 +220,13 @@ def _others(done: Executed) -> str:
     them again.
     """
     found = f"; deactivated {', '.join(done.deactivated)}" if done.deactivated else ""
-    back = (
-        f"; `dxlrun switch --activate {' '.join(done.offered)}` lets {', '.join(done.offered)} command again"
-    )
+    back = f"; activate {', '.join(done.offered)} again: `dxlrun switch --activate {' '.join(done.offered)}`"
     return found + (back if done.offered else "")
 
 
 def _named(joints: Sequence[str]) -> Sequence[str]:
     if not joints:
-        raise InputError("no joint is named; name joints, a group or a controller for its joints, or all")
+        raise InputError(
+            "the command needs joints; name joints, groups, controllers (for their joints), or all"
+        )
     return joints

@@ -90,17 +90,17 @@ def play_motions(
 
 def _check(motions: Sequence[str], loop: int, *, listed: bool, wait: bool) -> None:
     if listed and motions:
-        raise InputError(f"--list shows what there is to play; omit {' '.join(motions)}")
+        raise InputError(f"--list takes no motions; omit {' '.join(motions)}")
     if not (listed or motions):
         raise InputError("name a motion; `dxlrun play --list` shows those of the robot")
     if not 1 <= loop <= MOST_LOOPS:
-        raise InputError(f"--loop {loop}: give how often all is played, from 1 to {MOST_LOOPS}")
+        raise InputError(f"--loop {loop} is not a number of repetitions; give 1 to {MOST_LOOPS}")
     if not wait and loop * len(motions) > 1:
-        raise InputError("--no-wait returns when one motion has begun; omit it to play several")
+        raise InputError("--no-wait can start only one motion; omit it")
     for motion in motions:
         path = Path(motion)
         if not path.is_file() and (path.suffix or path.name != motion):
-            raise InputError(f"there is no motion file {motion}; check the path")
+            raise InputError(f"motion file {motion} not found; check the path")
 
 
 def _play(robot: RemoteRobot, found: MotionSource, speed: float, chosen: RobotChoice, *, wait: bool) -> int:
@@ -142,12 +142,12 @@ def _found(robot: RemoteRobot, name: str) -> MotionSource:
             *(f"`dxlrun play {file}`" for file in fitting),
             *(f"`dxlrun send {player} {PLAY} motion={name}`" for player in having),
         ]
-        raise InputError(f"there are {len(ways)} motions {name}; choose one: {', '.join(ways)}")
+        raise InputError(f"{len(ways)} motions have the name {name}; choose one: {', '.join(ways)}")
     if fitting or having:
         return MotionSource(name, fitting[0]) if fitting else MotionSource(name, Path(name), having[0])
     known = [each.motion for each in _playable(info)]
     raise InputError(
-        f"{robot.name} has no motion {name}, and there is no file of that name; {suggestion(name, known)}"
+        f"{robot.name} has no motion {name}, and no file has this name; {suggestion(name, known)}"
     )
 
 
@@ -193,7 +193,7 @@ def _list(robot: RemoteRobot, chosen: RobotChoice) -> None:
         show_json([row._asdict() for row in rows])
         return
     if not rows:
-        show_parts(f"{robot.name} has no motions; `dxlrun teach` records some")
+        show_parts(f"{robot.name} has no motions; record one by `dxlrun teach`")
         return
     columns = [Column(name, "name") for name in ("motion", "controllers", "joints")]
     columns += [Column("length", form="{:.2f} s"), Column("file", "name")]

@@ -100,7 +100,7 @@ def list_robots(
     for info in found:
         _show_robot(info, graph)
     if not found and not code and not unsteered:
-        show_parts("no robot runs that can be steered; `dxlrun ROBOT.yaml` starts one")
+        show_parts("no running robot found; start one by `dxlrun ROBOT.yaml`")
     return code
 
 
@@ -184,7 +184,12 @@ def halt(*, chosen: RobotChoice = ONLY_ONE) -> int:
         text = f"{robot.name} stands still"
         if (found := done.halted) is not None:
             text += f" after {found.seconds:.2f} s ({found.joint}: {found.velocity:.2g} rad/s)"
-        return report_done(robot, chosen, done, f"{text}; `dxlrun switch --activate NAME` lets it continue")
+        return report_done(
+            robot,
+            chosen,
+            done,
+            f"{text}; to continue, activate a controller: `dxlrun switch --activate NAME`",
+        )
 
 
 def take_over(*, chosen: RobotChoice = ONLY_ONE) -> int:
@@ -204,7 +209,7 @@ def pause(*, chosen: RobotChoice = ONLY_ONE) -> int:
     """
     with connect_robot(chosen.robot, "pause") as robot:
         done = robot.pause()
-        text = "is paused, its joints are held; `dxlrun resume` ends that"
+        text = "is paused, its joints are held; continue by `dxlrun resume`"
         return report_done(robot, chosen, done, f"{robot.name} {text}")
 
 
@@ -236,10 +241,10 @@ def load_controller(
 
     entry = WrittenEntry.from_words(words, file).data
     if "type" not in entry:
-        raise InputError(f"{name} has no type; give it one, such as type=joint_group_position_controller")
+        raise InputError(f"{name} has no type; give one, such as type=joint_group_position_controller")
     with connect_robot(chosen.robot, "load") as robot:
         done = robot.load(name, entry)
-        text = f"{name} is loaded; `dxlrun switch --activate {name}` starts it"
+        text = f"{name} is loaded; start it by `dxlrun switch --activate {name}`"
         return report_done(robot, chosen, done, f"{robot.name}: {text}")
 
 
@@ -321,7 +326,7 @@ def connect_robot(name: str | None, verb: str) -> RemoteRobot:
     if name is not None:
         _require_known(name, known)
     elif not names:
-        raise DxlrunError("no robot runs that can be steered; `dxlrun ROBOT.yaml` starts one")
+        raise DxlrunError("no running robot found; start one by `dxlrun ROBOT.yaml`")
     else:
         _require_one(names)
     return connect(name or names[0], f"dxlrun {verb}")
@@ -337,7 +342,7 @@ def _require_known(robot: str | None, names: Collection[str]) -> None:
     checked.
     """
     if robot is not None and robot not in names and "@" not in robot:
-        raise InputError(f"no robot {robot} runs; {suggestion(robot, names)}")
+        raise InputError(f"robot {robot} is not running; {suggestion(robot, names)}")
 
 
 def report_done(robot: RemoteRobot, chosen: RobotChoice, done: Executed | None, sentence: str) -> int:

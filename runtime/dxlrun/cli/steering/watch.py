@@ -230,7 +230,7 @@ def sources(watched: WatchedRobot) -> Table:
 def _age(row: Row) -> Cell:
     age = row["age"]
     if not isinstance(age, int | float):
-        return Cell("none came", "warning")
+        return Cell("no states", "warning")
     text = f"{age * 1e3:.0f} ms"
     # The same text as in `dxlrun get`.
     return Cell(text) if row["valid"] else Cell(f"{text}, not valid", "warning")
@@ -254,13 +254,19 @@ def controllers(watched: WatchedRobot) -> Table:
 def event_lines(watched: WatchedRobot, most: int) -> list[Sentence]:
     """Return lines for the last `most` events, the newest one last, with their age."""
     lines = []
-    for event in watched.events[-most:] if most > 0 else []:
+    shown = [event for event in watched.events if not _belongs_to_start(event)]
+    for event in shown[-most:] if most > 0 else []:
         severity = event["severity"]
         tone: Tone = "error" if severity >= 40 else "warning" if severity >= 30 else "plain"
         text = " ".join(str(event["text"]).split())
         ago = watched.states.time_ns * 1e-9 - event["time"]
         lines.append(Sentence(f"{ago:5.1f} s ago, {event['source']}: {text}", tone))
     return lines
+
+
+def _belongs_to_start(event: Row) -> bool:
+    """Return whether an event reports the pause in which a run waits for its gateway, at every start."""
+    return event["name"] == "steered" and event["text"] in ("pause from loop", "resume from loop")
 
 
 def snapshot(watched: WatchedRobot) -> tuple[Table | Sentence, ...]:

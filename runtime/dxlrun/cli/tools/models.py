@@ -81,7 +81,7 @@ def _tables(name: str | None, protocol: float | None) -> tuple[list[ControlTable
     from dxlwire.control_table.device_models import device_table, device_tables, perhaps_meant_device
 
     if protocol not in (None, 1.0, 2.0):
-        raise InputError(f"there is no Protocol {protocol:g}; --protocol is 1.0 or 2.0")
+        raise InputError(f"--protocol {protocol:g} does not exist; give 1.0 or 2.0")
     if name is None:
         servos = [table for table in all_tables() if protocol in (None, table.protocol)]
         return servos, [table for table in device_tables() if protocol in (None, table.protocol)]
@@ -195,7 +195,7 @@ def _device_facts(table: DeviceTable) -> Table:
 
     known = ("ping, read and write", *(CAPABILITIES[name] for name in sorted(table.capabilities)))
     facts = [
-        ("read each cycle", ", ".join(table.cyclic) or "what the robot file names"),
+        ("read each cycle", ", ".join(table.cyclic) or "the items in the robot file"),
         ("can be commanded", ", ".join(_commands(table)) or "nothing"),
         ("can", "; ".join(known)),
         ("baud rates", ", ".join(str(rate) for rate in sorted(table.baud_rates.values())) or "not listed"),

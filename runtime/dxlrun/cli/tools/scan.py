@@ -102,7 +102,7 @@ def read_search(protocol: float | None, baud: Sequence[int], ids: str | None) ->
 
     wrong = []
     if protocol not in (None, 1.0, 2.0):
-        wrong.append(f"there is no Protocol {protocol:g}; --protocol is 1.0 or 2.0")
+        wrong.append(f"--protocol {protocol:g} does not exist; give 1.0 or 2.0")
     wrong += [
         f"--baud {rate} is not a rate of a servo; give bit/s from 9600 to {_FASTEST}"
         for rate in baud
@@ -127,7 +127,7 @@ def read_ids(text: str) -> tuple[int, ...]:
             raise InputError(f"--ids {text}: {part!r} is not an ID; give for example 1-20 or 1,4,7")
         span = range(int(first), int(last if dash else first) + 1)
         if not span or span[-1] > HIGHEST_ID:
-            raise InputError(f"--ids {text}: {part} is not an ID of a servo; they are 0..{HIGHEST_ID}")
+            raise InputError(f"--ids {text}: {part} is not an ID of a servo; give 0 to {HIGHEST_ID}")
         found.update(span)
     return tuple(sorted(found))
 
@@ -148,10 +148,8 @@ def _show(port: str, scanned: ScanResult, rates: Mapping[int, int], *, narrowed:
     from dxlwire.port.adapters import warnings_for
 
     nothing = (
-        f"no servo answers at {port}: check power, cable, and that the adapter is the one of the servos; "
-        "`dxlrun doctor` lists the adapters"
-        + "; without --protocol, --baud and --ids everything is tried"
-        * narrowed
+        f"no servo answers at {port}; check power, cable and port (`dxlrun doctor` lists the adapters)"
+        + ", or omit --protocol, --baud and --ids to try everything" * narrowed
     )
     errors = [] if scanned.servos else [nothing]
     set_as = {rate: f": its driver set {real}" for rate, real in rates.items()}
@@ -234,7 +232,7 @@ def draft(stem: str, port: str, servos: Sequence[FoundServo], latency_ns: int) -
     """Return the text of a drafted robot file, compiled as a test; raises ServoFault as `draft_file`."""
     known = [servo for servo in servos if servo.model]
     if not any(not each.device for each in known):
-        raise ServoFault("no servo of a known model was found, so there is no robot file to write")
+        raise ServoFault("no servo of a known model was found, so no robot file was written")
     lines = sorted({(servo.protocol, servo.baud_rate) for servo in known})
     if len(lines) > 1:
         found = [
@@ -242,9 +240,8 @@ def draft(stem: str, port: str, servos: Sequence[FoundServo], latency_ns: int) -
             for protocol, rate in lines
         ]
         raise ServoFault(
-            f"these servos cannot share a bus ({'; '.join(found)}); `dxlrun servo {port} ID baud RATE` "
-            "brings one to another rate, two protocols need two ports; or scan one of them alone by "
-            "--protocol and --baud"
+            f"these servos cannot share a bus ({'; '.join(found)}); give them one baud rate by "
+            f"`dxlrun servo {port} ID baud RATE`, or scan each kind alone by --protocol and --baud"
         )
     from dxlrun.compile.robot_compiler import compile_files
 
@@ -288,16 +285,15 @@ def _text(stem: str, port: str, servos: Sequence[FoundServo], latency_ns: int, r
             "    port: ${port}",
             f"    protocol: {first.protocol}",
             f"    baud_rate: {first.baud_rate}",
-            f"    adapter: {{latency: {latency_ns * 1e-6:g} ms}}  # 0 ms where it keeps nothing back",
+            f"    adapter: {{latency: {latency_ns * 1e-6:g} ms}}  # 0 ms without a latency timer",
             f"    return_delay_time: {delay_ns / 1000:g} us  # as found",
             "",
             "loop:",
-            f"  rate: {rate}  # `dxlrun check` prints the highest that is possible",
+            f"  rate: {rate}  # `dxlrun check` prints the highest possible rate",
             "",
-            f"# Every joint is held to {velocity} deg/s, so that the first commands move it slowly. Once its",
-            "# limits and direction are right, raise its limits.velocity; without a limit it moves as fast",
-            "# as its servo can.",
-            "joints:  # names and directions are yours to choose; a reference is where a joint's 0 is",
+            f"# Every joint is limited to {velocity} deg/s, so that the first commands move it slowly. Raise",
+            "# limits.velocity after you have checked the limits and the direction of a joint.",
+            "joints:  # choose names and directions; the reference is the servo's angle at joint position 0",
             *joints,
             *(("", "devices:", *devices) if devices else ()),
             "",
@@ -326,7 +322,7 @@ def _joint(servo: FoundServo, velocity: int) -> list[str]:
     comment = "reference: middle of the travel"
     if servo.lowest is not None and servo.highest is not None:
         if servo.lowest >= servo.highest:
-            comment += "; it has no position limits now, a wheel is `continuous: true`"
+            comment += "; the servo has no position limits; write `continuous: true` for a wheel"
         elif servo.lowest > table.min_tick or servo.highest < table.max_tick:
             degrees = math.degrees(table.rad_per_tick)
             low = math.ceil((servo.lowest * degrees - reference) * 10) / 10

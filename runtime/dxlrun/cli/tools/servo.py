@@ -94,7 +94,7 @@ def servo(
         elif verb in _OF_DEVICES:
             done = _OF_DEVICES[verb](one, asked)
         else:
-            raise InputError(f"{one.called} is not a servo, so it cannot {verb}; it has get and set")
+            raise InputError(f"{one.called} is not a servo and cannot {verb}; use get or set")
         asked.done += filter(None, done)
     _show(one, verb, asked, as_json=as_json)
     return 1 if asked.declined else 0
@@ -103,7 +103,7 @@ def servo(
 def _check(servo_id: int, verb: str, asked: VerbCall) -> None:
     """Raise InputError for an invalid ID, verb, words or option, before the port is opened."""
     if not 0 <= servo_id <= HIGHEST_ID:
-        raise InputError(f"{servo_id} is not an ID of a servo; they are 0..{HIGHEST_ID}")
+        raise InputError(f"{servo_id} is not an ID of a servo; give 0 to {HIGHEST_ID}")
     found = VERBS.get(verb)
     if found is None:
         from dxlrun.errors import suggestion
@@ -124,8 +124,8 @@ def _find(tool: ToolLine, servo_id: int, search: Search) -> FoundServo:
     port, found = tool.port.name, find_servo(tool, servo_id, search)
     if not found:
         raise ServoFault(
-            f"no servo with ID {servo_id} answers at {port}: check power, cable and ID; `dxlrun scan {port}` "
-            "lists the servos"
+            f"no servo with ID {servo_id} answers at {port}; check power, cable and ID (`dxlrun scan {port}` "
+            "lists the servos)"
         )
     if len(found) > 1:
         places = "; ".join(f"Protocol {each.protocol} at {each.baud_rate} bit/s" for each in found)
@@ -334,7 +334,7 @@ def _whole(what: str, lowest: int, highest: int) -> Callable[[VerbCall], None]:
 
 def _on_or_off(asked: VerbCall) -> None:
     if asked.words[0] not in ("on", "off"):
-        raise InputError(f"torque is switched on or off, not {asked.words[0]!r}")
+        raise InputError(f"torque cannot be {asked.words[0]!r}; write on or off")
 
 
 _OF_DEVICES: Mapping[str, Callable[[OneNode, VerbCall], Iterable[str]]] = {"get": _get, "set": _set}

@@ -41,7 +41,7 @@ class Publisher:
         t_ns = self._record.woken_ns
         data = self._message.pack(message, divmod(max(0, t_ns + self._epoch_offset_ns), 1_000_000_000))
         if len(data) > LONGEST_MESSAGE:
-            raise WrongMessage(f"takes {LONGEST_MESSAGE} bytes at most, not {len(data)}")
+            raise WrongMessage(f"{len(data)} bytes, more than {LONGEST_MESSAGE}")
         self._sink.message(self._number, t_ns, data)
 
 
@@ -129,4 +129,4 @@ class ControllerTopics:
         try:
             publisher.publish(message)
         except WrongMessage as error:
-            raise ControllerFault(f"published an invalid message: topic {topic} {error}") from None
+            raise ControllerFault(f"published an invalid message on topic {topic}: {error}") from None

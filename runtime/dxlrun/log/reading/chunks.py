@@ -232,11 +232,11 @@ class McapFile:
             # A wrong length may have skipped the next chunk.
             begin = min(begin, self._anchor)
             self.end, self._anchor = found, found + 1
-            self.damage.append(f"the data between byte {begin} and byte {found}{self._of} cannot be read")
+            self.damage.append(f"bytes {begin} to {found}{self._of} cannot be read")
             return True
         stream.seek(begin)
         if stream.read(1) == b"\0":
-            self.damage.append(f"the data after byte {begin}{self._of} cannot be read: it is not a record")
+            self.damage.append(f"the bytes after {begin}{self._of} cannot be read: they are not a record")
         return False
 
     @property
@@ -270,7 +270,7 @@ class McapFile:
                     raise EOFError("a record is longer than its chunk")
                 if opcode == message:
                     if length < _MESSAGE_HEAD:
-                        raise EOFError("a message is shorter than its head")
+                        raise EOFError("a message is shorter than its header")
                     keep(at)
                 elif opcode in _OPENS:
                     _READ[Opcode(opcode)](self, ReadDataStream(BytesIO(data[body:after])))
@@ -309,7 +309,7 @@ class McapFile:
         else:
             raise EOFError(f"its compression {chunk.compression!r} is not known")
         if len(data) != size:
-            raise EOFError("it has another length than it declares")
+            raise EOFError("it has the wrong length")
         if chunk.uncompressed_crc not in (0, zlib.crc32(data)):
             raise EOFError("its bytes do not agree with their CRC")
         return data
@@ -340,7 +340,7 @@ class McapFile:
         # The summary at the end repeats all channels, without a CRC.
         if known != found:
             self.damage.append(
-                f"the topic {known.topic} is described in two ways{self._of}; the first counts"
+                f"topic {known.topic} has two different definitions{self._of}; the first one is used"
             )
 
     def _take_attachment(self, body: ReadDataStream) -> None:
@@ -351,7 +351,7 @@ class McapFile:
             self._take_room(size)
             name, data = name.removesuffix(COMPRESSED_SUFFIX), _of_zstd(data, size + 1)
             if len(data) != size:
-                raise EOFError("it has another length than it declares")
+                raise EOFError("it has the wrong length")
         self.attachments[name] = data
 
     def _take_metadata(self, body: ReadDataStream) -> None:

@@ -162,7 +162,7 @@ class Slicer:
         for channel in np.unique(messages.channel).tolist():
             known = self._file.channels.get(channel)
             if known is None:
-                raise ValueError(f"a message is of channel {channel}, which the file does not have")
+                raise ValueError(f"a message is of the unknown channel {channel}")
             topic = known.topic
             if topic in _FOR_OTHERS:
                 continue
@@ -341,12 +341,12 @@ def _cycles(
 ) -> NDArray[np.void]:
     """Return the cycle records in messages of /cycle, checked for length and known modes."""
     if (size != len(ENCAPSULATION) + layout.size).any():
-        raise ValueError("the messages of /cycle are not as long as joints and controllers ask")
+        raise ValueError("the messages of /cycle do not fit the numbers of joints and controllers")
     bodies = pieces(data, start + len(ENCAPSULATION), size - len(ENCAPSULATION))
     array: NDArray[np.void] = bodies.view(layout.dtype)
     unknown = np.flatnonzero((array["mode"] > max(Mode)).any(axis=1))
     if len(unknown):
-        raise ValueError(f"cycle {array['cycle'][unknown[0]]} has a mode of a servo that is not known")
+        raise ValueError(f"cycle {array['cycle'][unknown[0]]} has an unknown mode of a servo")
     return array
 
 

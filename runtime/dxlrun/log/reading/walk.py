@@ -70,7 +70,7 @@ class LogWalk:
                         yield messages
                 refused = None
             except _OtherRunError:
-                found.damage.append(f"{file.name} is of another run and was skipped")
+                found.damage.append(f"{file.name} belongs to another run and was skipped")
                 found.finished = True
             except LogError as error:
                 if len(log.files) == 1:
@@ -93,8 +93,8 @@ class LogWalk:
         """Sentence that the last file read has no end, with the reason."""
         name = self.file.name or "the file"
         if self.is_being_written:
-            return f"{name} has no end yet: a run is writing it"
-        return f"{name} has no end: its recorder was killed, or could write no more"
+            return f"{name} is still being written by a run"
+        return f"{name} ends early: the recorder was killed or could not write"
 
     def _take_metadata(self, name: str, record: dict[str, str]) -> None:
         if name == METADATA_NAME and self.file.metadata.get(name) not in (None, record):
@@ -118,12 +118,12 @@ def _opened(path: Path) -> Iterator[tuple[IO[bytes], int]]:
         with path.open("rb", buffering=_BUFFER) as stream:
             size = os.fstat(stream.fileno()).st_size
             if size == 0:
-                raise LogError(f"{path}: the file is empty; its recorder never began to write")
+                raise LogError(f"{path}: the file is empty: the recorder wrote nothing")
             start = stream.read(LONGEST_MAGIC)
             if not start.startswith(MAGIC):
                 if kind := kind_of_bytes(start, path):
                     raise LogError(f"{path}: {'; '.join(kind)}")
-                raise LogError(f"{path}: this is not an MCAP file, and a log of dxlrun is one")
+                raise LogError(f"{path}: this is not an MCAP file; give a log of dxlrun")
             yield stream, size
     except OSError as error:
         raise LogError(f"{path}: cannot be read: {error.strerror or error}") from error

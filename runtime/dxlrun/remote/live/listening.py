@@ -95,7 +95,7 @@ class MessageIterator:
             while not self._ended:
                 yield from self._arrived()
                 if not self._ended and not look.poll(TIMEOUT_S * 1e3):
-                    raise self._gone(f"nothing came for {TIMEOUT_S:g} s")
+                    raise self._gone(f"no data for {TIMEOUT_S:g} s")
         finally:
             self.close()
 
@@ -114,7 +114,7 @@ class MessageIterator:
                         async with asyncio.timeout(TIMEOUT_S):
                             self._bytes += await receive(self._end, _CHUNK)
         except TimeoutError:
-            raise self._gone(f"nothing came for {TIMEOUT_S:g} s") from None
+            raise self._gone(f"no data for {TIMEOUT_S:g} s") from None
         finally:
             self.close()
 

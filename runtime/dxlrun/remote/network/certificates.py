@@ -44,7 +44,7 @@ def server_context(name: str) -> ssl.SSLContext:
 
     Raises InputError when a file is missing or readable by others, or clients would refuse the certificate.
     """
-    context = _context(ssl.PROTOCOL_TLS_SERVER, name, f"`dxlrun keys robot {name}` makes it")
+    context = _context(ssl.PROTOCOL_TLS_SERVER, name, f"make it by `dxlrun keys robot {name}`")
     # A ticket is sent unasked, and clients take any byte without a request for a closed connection.
     context.num_tickets = 0
     _try(context, name)
@@ -56,7 +56,7 @@ def client_context() -> ssl.SSLContext:
     """Return this user's TLS context for connections to robots; raises InputError when a file is missing or
     wrong.
     """
-    made = "`dxlrun keys client NAME --output DIRECTORY` on the robot's computer makes it, to be copied here"
+    made = "make it on the robot's computer by `dxlrun keys client NAME --output DIRECTORY`, and copy it here"
     return _context(ssl.PROTOCOL_TLS_CLIENT, CLIENT, made)
 
 
@@ -67,14 +67,16 @@ def _context(protocol: int, name: str, remedy: str) -> ssl.SSLContext:
         if not file.is_file():
             raise InputError(f"{file} is missing; {remedy}")
     if key.stat().st_mode & 0o077:
-        raise InputError(f"{key} can be read by other users: chmod 600 {key}, or renew it")
+        raise InputError(f"other users can read {key}; run `chmod 600 {key}`, or renew the key")
     context = ssl.SSLContext(protocol)
     context.minimum_version = ssl.TLSVersion.TLSv1_3
     try:
         context.load_cert_chain(certificate, key, password="")
         context.load_verify_locations(authority)
     except (OSError, ValueError) as error:
-        raise InputError(f"{certificate}, its key and {authority} do not fit together: {error}") from error
+        raise InputError(
+            f"{certificate}, its key and {authority} do not match: {error}; make them again"
+        ) from error
     return context
 
 
@@ -96,7 +98,7 @@ def _try(server: ssl.SSLContext, name: str) -> None:
     except ssl.SSLCertVerificationError as error:
         certificate = keys_place() / f"{name}.crt"
         raise InputError(
-            f"{certificate}: {error.verify_message}; `dxlrun keys renew {name}` makes a new one"
+            f"{certificate}: {error.verify_message}; renew it by `dxlrun keys renew {name}`"
         ) from error
 
 

@@ -33,8 +33,8 @@ class NetworkLink(SocketLink):
         # asyncio does not send the reason.
         except ConnectionResetError as error:
             raise ConnectionResetError(
-                f"{error}; the run may have ended, or {keys_place() / CLIENT}.crt is expired, revoked "
-                "or of another authority"
+                f"{error}: the run has ended, or {keys_place() / CLIENT}.crt is expired, revoked "
+                "or signed by another authority"
             ) from error
 
     def _connected(self) -> socket.socket:

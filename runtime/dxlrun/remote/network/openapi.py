@@ -47,7 +47,7 @@ def openapi(abouts: Mapping[Request[Any, Any], str]) -> dict[str, object]:
             **({} if one.body is NoneType else {"requestBody": body}),
             "security": [{_TLS: [role.name.lower()]} for role in Role if role >= one.role],
             "responses": {
-                "2XX": {"description": "it is done", "content": {kind: {"schema": schemas[answers[one]]}}},
+                "2XX": {"description": "done", "content": {kind: {"schema": schemas[answers[one]]}}},
                 "default": {"description": "refused", "content": {_JSON: {"schema": schemas[NotDone]}}},
             },
         }
