@@ -113,7 +113,7 @@ WRONG = [
     ("POST", "/rate", b'{"rate": 1' + b"0" * 400 + b"}", 422, "invalid", "write for example"),
     ("POST", "/rate", {}, 422, "invalid", "missing required field `rate`"),
     ("DELETE", "/controllers/lefty", None, 404, "unknown_controller", "did you mean left?"),
-    ("POST", "/controllers", LOAD | {"name": "../x"}, 422, "invalid", "is not a name"),
+    ("POST", "/controllers", LOAD | {"name": "../x"}, 422, "invalid", "is not a valid name"),
     ("POST", "/controllers", LOAD | {"name": 5}, 422, "invalid", "must be text"),
     ("POST", "/controllers", LOAD | {"name": "a" * 65}, 422, "invalid", "at most 64"),
     ("POST", "/controllers", LOAD | {"name": "left"}, 409, "name_taken", "the run already has a controller left"),
@@ -128,7 +128,7 @@ WRONG = [
     ("POST", "/controllers", LOAD | {"into": "lefty"}, 422, "invalid", "`into` of more names an unknown controller lefty; did you mean left?"),
     ("POST", "/controllers", LOAD | {"into": ["left", "more"]}, 422, "invalid", "left, but left exports no reference; remove `into`; no controller of the robot"),
     ("POST", "/controllers", LOAD | {"into": ["left", "more"]}, 422, "invalid", "`into` of more names more itself"),
-    ("POST", "/controllers", LOAD | {"into": 3}, 422, "invalid", "names no controller"),
+    ("POST", "/controllers", LOAD | {"into": 3}, 422, "invalid", "is not the name of a controller"),
     ("POST", "/controllers", b"[]", 422, "invalid", "Expected `object`"),
 ]  # fmt: skip
 
