@@ -2,14 +2,13 @@
 
 Never another exception than LogError, never more memory than the bound, never a cycle that was not written.
 What is not hit is read: each whole chunk before a cut, every chunk but the one of a flipped bit. CI takes
-some of the places and 60 flips from a fixed seed; all of them:
+100 cuts and 60 flips. The full campaign cuts at every byte:
 
-    DXLRUN_DAMAGE=10000 python -m pytest tests/log/test_damage_campaign.py -q
+    pytest --campaign=release tests/log/test_damage_campaign.py
 """
 
 from __future__ import annotations
 
-import os
 import random
 import signal
 import subprocess
@@ -24,6 +23,7 @@ from textwrap import dedent
 import pytest
 from mcap.records import Chunk
 from mcap.stream_reader import StreamReader
+from tests.kit.campaigns import campaign
 
 from dxlrun.channels.logged_packets import PacketBatch
 from dxlrun.channels.ring import Handover, RecordKind
@@ -33,10 +33,7 @@ from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.schemas import LogHeader
 from dxlwire.packets import PacketKind
 
-pytestmark = pytest.mark.campaign
-COUNT = int(os.environ.get("DXLRUN_DAMAGE", "60"))
-EVERY = 1 if COUNT >= 10_000 else 211
-SEED = os.environ.get("DXLRUN_DAMAGE_SEED", "1")
+EVERY_BYTE = 100_000  # more than the log has
 CHUNKS, CYCLES = 6, 4
 """Chunks of the log, and cycles of each."""
 MOST_MEMORY = 24 << 20
@@ -113,48 +110,55 @@ def read(path: Path, data: bytes) -> tuple[list[bytes], list[bytes], LogReader] 
     return cycles, packets, reader
 
 
+@campaign(ci=100, night=2000, release=EVERY_BYTE)
 def test_a_log_that_is_cut_at_any_byte_is_read_up_to_its_last_whole_chunk(
-    written: Written, tmp_path: Path
+    written: Written, tmp_path: Path, amount: float, chance: random.Random
 ) -> None:
     first = written.data.index(b"dxlrun_msgs")  # before it there is no header yet
-    for size in range(0, len(written.data), EVERY):
+    every = range(len(written.data))
+    for size in every if amount >= len(every) else chance.sample(every, int(amount)):
         found = read(tmp_path / "cut.mcap", written.data[:size])
         whole = sum(end <= size for end in written.ends)
         if found is None:
-            assert size < first or whole == 0
+            assert size < first or whole == 0, size
             continue
-        assert found[0] == list(written.cycles[: whole * CYCLES])
+        assert found[0] == list(written.cycles[: whole * CYCLES]), size
         assert len(found[1]) == 2 * whole * CYCLES
         assert not found[2].about.complete
         if whole == CHUNKS:
             assert "no end" in found[2].damage[-1]
 
 
+@campaign(ci=60, night=1000, release=10_000)
 def test_a_flipped_bit_costs_one_chunk_at_most(
-    written: Written, tmp_path: Path, most_memory: Callable[[], int]
+    written: Written,
+    tmp_path: Path,
+    most_memory: Callable[[], int],
+    amount: float,
+    chance: random.Random,
 ) -> None:
-    chance = random.Random(f"flip {SEED}")
     refused = lost = 0
-    for _ in range(COUNT):
+    count = int(amount)
+    for _ in range(count):
         at = chance.randrange(len(written.data))
         data = bytearray(written.data)
         data[at] ^= 1 << chance.randrange(8)
         found = read(tmp_path / "flipped.mcap", bytes(data))
         if found is None:
             refused += 1
-            assert at < written.ends[0]
+            assert at < written.ends[0], at
             continue
         cycles, _, reader = found
         missing = len(written.cycles) - len(cycles)
         lost += missing
-        assert set(cycles) <= set(written.cycles)
+        assert set(cycles) <= set(written.cycles), at
         assert missing in (0, CYCLES), (at, reader.damage)
         if missing:
             hit = written.cycles.index(next(one for one in written.cycles if one not in cycles)) // CYCLES
             assert hit == written.chunk_of(at), (at, hit)
             assert reader.damage
     assert most_memory() < MOST_MEMORY
-    print(f"{COUNT} flips: {refused} refused, {lost} cycles lost of {COUNT * len(written.cycles)}")
+    print(f"{count} flips: {refused} refused, {lost} cycles lost of {count * len(written.cycles)}")
 
 
 @pytest.mark.parametrize("opcode", [2, 7, 14, 0x46, 0])
@@ -174,11 +178,15 @@ def test_a_chunk_that_is_another_record_by_one_bit_is_missed(
     )
 
 
-def test_a_length_that_is_wrong_takes_no_memory_and_costs_what_it_covers(
-    written: Written, tmp_path: Path, most_memory: Callable[[], int]
+@campaign(ci=30, night=200, release=1000)
+def test_a_wrong_length_takes_no_memory_and_costs_what_it_covers(
+    written: Written,
+    tmp_path: Path,
+    most_memory: Callable[[], int],
+    amount: float,
+    chance: random.Random,
 ) -> None:
-    chance = random.Random(f"length {SEED}")
-    for _ in range(max(COUNT // 10, 30)):
+    for _ in range(int(amount)):
         size = chance.choice((4, 8))
         at = chance.randrange(8, len(written.data) - size)
         length = min(chance.choice(LENGTHS), 2 ** (8 * size) - 1)
@@ -215,18 +223,21 @@ WRITER = """
             if split:
                 log.settle()
 """
-KILLS = int(os.environ.get("DXLRUN_RECORDER_KILLS", "3"))
 
 
+@campaign(ci=3, night=20, release=100)
 @pytest.mark.parametrize("split_ns", [0, 300_000_000], ids=["one file", "parts"])
-def test_after_kill_9_all_that_was_flushed_is_read(tmp_path: Path, split_ns: int) -> None:
-    rng = random.Random(int(os.environ.get("DXLRUN_RECORDER_SEED", "15")) + split_ns)
-    for number in range(KILLS):
+def test_all_that_was_flushed_before_kill_9_is_read(
+    tmp_path: Path, split_ns: int, amount: float, chance: random.Random
+) -> None:
+    for number in range(int(amount)):
+        lines_read = chance.randrange(100, 1500)
+        print(f"kill after {lines_read} lines")
         path = tmp_path / f"{number}.mcap"
         command = [sys.executable, "-c", dedent(WRITER), str(path), str(split_ns)]
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as child:
             assert child.stdout is not None
-            lines = list(islice(child.stdout, rng.randrange(100, 1500)))
+            lines = list(islice(child.stdout, lines_read))
             child.send_signal(signal.SIGKILL)
             lines += child.stdout.readlines()
         handed = sum(line.strip().isdigit() for line in lines)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import random
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -18,6 +17,7 @@ from msgspec import structs
 from msgspec.structs import replace
 from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_typestore
+from tests.kit.campaigns import campaign
 
 from dxlrun.channels.cycle import CycleRecord
 from dxlrun.channels.ring import RecordKind
@@ -33,7 +33,6 @@ from dxlsim.geometry.urdf import read_urdf
 
 ROBOTS = Path(__file__).parents[2] / "robots"
 TORSO = ROBOTS / "urdf/bioloid_torso.urdf"
-POSES = int(os.environ.get("DXLRUN_POSES", "10"))
 ONLY_311 = "in the extra `test` on Python 3.11 only"
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 Matrix = NDArray[np.float64]
@@ -98,9 +97,11 @@ class Scene:
 # Against pinocchio, from the bytes that rosbags reads
 
 
-@pytest.mark.campaign
+@campaign(ci=10, night=200, release=1000)
 @pytest.mark.parametrize("path", sorted(ROBOTS.rglob("*.urdf")), ids=lambda path: path.stem)
-def test_logged_frames_lie_where_pinocchio_has_them(path: Path) -> None:
+def test_poses_of_logged_frames_are_those_of_pinocchio(
+    path: Path, amount: float, chance: random.Random
+) -> None:
     pin = pytest.importorskip(
         "pinocchio", reason="pin has 380 MB, so CI does not install it: pip install pin"
     )
@@ -110,9 +111,8 @@ def test_logged_frames_lie_where_pinocchio_has_them(path: Path) -> None:
     moving = [joint for joint in urdf.joints if joint.moves and joint.mimic is None]
     scene = Scene(path.read_text(), tuple(joint.name for joint in moving))
     still = transforms(scene.still) if scene.messages.any_still else {}
-    drawn = random.Random(path.stem)
-    for _ in range(POSES):
-        positions = {joint.name: drawn.uniform(-4, 4) for joint in moving}
+    for _ in range(int(amount)):
+        positions = {joint.name: chance.uniform(-4, 4) for joint in moving}
         q = pin.neutral(model)
         for name, position in positions.items():
             place = model.joints[model.getJointId(name)]

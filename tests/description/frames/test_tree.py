@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import random
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from tests.kit.campaigns import campaign
 
 from dxlrun.description.frames.tree import FrameTree
 from dxlrun.errors import InputError
@@ -18,7 +18,6 @@ from dxlsim.geometry.transform import Quaternion, Transform, from_rpy, near, uni
 from dxlsim.geometry.urdf import Urdf, read_urdf
 
 ROBOTS = Path(__file__).parents[3] / "robots"
-POSES = int(os.environ.get("DXLRUN_POSES", "10"))
 EVERY_KIND = """\
 <robot name="every_kind">
   <link name="base_link"/><link name="rail"/><link name="arm"/><link name="imu_link"/><link name="wheel"/>
@@ -51,9 +50,9 @@ def test_no_robot_with_a_urdf_is_left_out() -> None:
     assert "bioloid_torso" in dict(texts())
 
 
-@pytest.mark.parametrize(("name", "text"), [*texts()], ids=[name for name, _ in texts()])
-@pytest.mark.campaign
-def test_frames_lie_where_pinocchio_has_them(name: str, text: str) -> None:
+@campaign(ci=10, night=200, release=1000)
+@pytest.mark.parametrize("text", [text for _, text in texts()], ids=[name for name, _ in texts()])
+def test_poses_of_frames_are_those_of_pinocchio(text: str, amount: float, chance: random.Random) -> None:
     pin = pytest.importorskip(
         "pinocchio", reason="pin has 380 MB, so CI does not install it: pip install pin"
     )
@@ -61,10 +60,9 @@ def test_frames_lie_where_pinocchio_has_them(name: str, text: str) -> None:
     tree = FrameTree(urdf, ())
     model = pin.buildModelFromXML(text, mimic=True)
     data = model.createData()
-    drawn = random.Random(name)
     moving = [joint for joint in urdf.joints if joint.moves and joint.mimic is None]
-    for _ in range(POSES):
-        positions = {joint.name: drawn.uniform(-7, 7) for joint in moving}
+    for _ in range(int(amount)):
+        positions = {joint.name: chance.uniform(-7, 7) for joint in moving}
         q = pin.neutral(model)
         for joint, position in positions.items():
             place = model.joints[model.getJointId(joint)]
