@@ -77,7 +77,7 @@ def test_a_silent_servo_and_an_unknown_one_are_named():
     line.buses[0].servo(2).poke("model_number", 999)
     found = line.asked([make_plan((1, 2), name="arm", joints=("a", "b"))], "ab")
     assert "a (ID 1 on bus arm) does not answer at 1000000 bit/s" in found["a"].problem
-    assert "b (ID 2 on bus arm) is model number 999" in found["b"].problem
+    assert "b (ID 2 on bus arm) has model number 999" in found["b"].problem
     assert [one.model for one in found.values()] == ["", ""]
 
 

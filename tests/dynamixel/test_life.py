@@ -65,7 +65,7 @@ def test_what_follows_from_a_state_is_derived_at_each_transition(one, state, eve
 )
 def test_an_event_that_a_state_does_not_have_is_refused_and_changes_nothing(one, state, event):
     put(one, state)
-    with pytest.raises(IllegalTransition, match=f"main_1_joint .* is {state.value}, where {event.value}"):
+    with pytest.raises(IllegalTransition, match=f"main_1_joint .* is {state.value}; {event.value}"):
         one.on(0, event)
     assert one.states[0] is state
     assert one.reads.away[0] == (state is ServoState.OFFLINE)

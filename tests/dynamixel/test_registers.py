@@ -194,7 +194,7 @@ def test_a_servo_that_acknowledges_a_register_and_keeps_the_old_value_gets_no_to
     rig.stick(11, "position_p_gain", 800)
     with pytest.raises(StartUpError) as caught:
         rig.hardware.start()
-    told = "arm_11_joint (ID 11 on bus arm) was given Position P Gain (84) = 850, but has 800"
+    told = "arm_11_joint (ID 11 on bus arm) has Position P Gain (84) = 800 after 850 was written"
     assert str(caught.value).splitlines() == [told]
     assert rig.torque() == [False, False]
     assert rig.events.texts(EventCode.REGISTER_WRITTEN) == []

@@ -65,7 +65,7 @@ def test_a_hot_servo_is_reported_ten_degrees_before_its_limit_and_when_it_has_co
     rig.cycles(70)
     ((source, text),) = rig.events.of(EventCode.SERVO_HOT)
     assert source == "main_12_joint"
-    assert "above its Temperature Limit (31), 80 deg C" in text
+    assert "above 80 deg C (Temperature Limit (31))" in text
     servo.temperature = servo.registers["temperature_limit"] - 12
     rig.cycles(70)
     assert len(rig.events.of(EventCode.SERVO_HOT)) == 1, "it is not cooled yet"

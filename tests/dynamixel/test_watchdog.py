@@ -93,7 +93,7 @@ def _answer_once(rig):
 @pytest.mark.parametrize(
     ("trick", "said"),
     [
-        (lambda rig: rig.stick(12, "bus_watchdog", 0), "was given Bus Watchdog (98) = 10, but has 0"),
+        (lambda rig: rig.stick(12, "bus_watchdog", 0), "has Bus Watchdog (98) = 0 after 10 was written"),
         (_answer_once, "did not answer when Bus Watchdog (98) was read back"),
     ],
 )
@@ -352,7 +352,7 @@ def run(program, answer):
         ),
         (
             Reply(TransactionOutcome.OK, 0, b"\x0a", 0, 0, False),
-            "was given Bus Watchdog (98) = 0, but has 10",
+            "has Bus Watchdog (98) = 10 after 0 was written",
         ),
     ],
 )
