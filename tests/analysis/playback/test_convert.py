@@ -54,11 +54,12 @@ def test_the_file_says_where_it_comes_from_and_is_never_written_over(
 ) -> None:
     done = dxlrun("convert", swing, "2nd-try.yaml", "--from", "1.5", "--to", "2")
     assert re.fullmatch(
-        rf"2nd-try.yaml: 0.5 s of {swing}, at most 0.1 deg from it: \d+ points for both\n", done.out
+        rf"2nd-try.yaml: 0.5 s of {swing}, with a deviation of at most 0.1 deg: \d+ points for both\n",
+        done.out,
     )
     text = (place / "2nd-try.yaml").read_text()
     assert text.startswith(
-        f"# Motion of {swing}, 1.500 s to 2.000 s: goals of pan, tilt, at most 0.1 deg from it.\n"
+        f"# Motion of {swing}, 1.500 s to 2.000 s: goals of pan, tilt, with a deviation of at most 0.1 deg.\n"
         "# Written by `dxlrun convert`.\nname: motion_2nd_try\n"
     )
     again = dxlrun("convert", swing, "2nd-try.yaml")
