@@ -10,13 +10,12 @@ from numpy.typing import NDArray
 
 from dxlrun import Log
 from dxlrun.tooling.logs import UNREADABLE
-from dxlrun.tooling.records import ClientCommand, Event, EventCode, TakenCommand
+from dxlrun.tooling.records import ClientCommand, Event, EventCode, StreamEnd, TakenCommand
 from dxlrun_analysis.conduct.client_commands import client_commands, policy_begun
 from dxlrun_analysis.cycles.punctuality import DISORDER_NS, begins, first_deadline_ns
 
 _LONGEST = 80  # Characters of unreadable data that are shown
 _ANSWERS = frozenset((EventCode.STEERED, EventCode.COMMAND_REFUSED))
-_HELD = "its joints are held"
 _CYCLE = np.dtype([(name, "i8") for name in ("cycle", "scheduled_ns", "woken_ns", "updated_ns")])
 """Fields of a cycle that are kept until its commands and answers are complete."""
 
@@ -99,7 +98,8 @@ class SteeringHistory:
             if event.code in _ANSWERS:
                 self._events.append(event)
             elif event.code == EventCode.STALE_COMMAND:
-                self._stale[event.source] = event.t_ns, _HELD in event.text
+                held = bool(event.data) and msgspec.json.decode(event.data, type=StreamEnd).held
+                self._stale[event.source] = event.t_ns, held
             elif event.code == EventCode.CONTROLLER_DEACTIVATED and event.source in self._stale:
                 self._left_ns[event.source] = event.t_ns
         rows = np.zeros(len(log.cycles), _CYCLE)

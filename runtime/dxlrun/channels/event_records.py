@@ -80,7 +80,8 @@ class EventCode(IntEnum):
     STEERED = 36
     """The loop executed a client's request: switch, rate, pause, resume, load, unload, stop."""
     STALE_COMMAND = 37
-    """The lease of a command stream or pause expired, and the policy `on_stale_command` begins."""
+    """The lease of a command stream or pause expired, and the policy `on_stale_command` begins; the data of a
+    stream are a StreamEnd."""
     CONTROLLER_LOADED = 38
     """A controller was loaded or unloaded while the loop was paused; the text has the duration."""
     POLICY = 39
@@ -154,6 +155,12 @@ class SchedulerGrant(msgspec.Struct, frozen=True):
 
     request: str
     granted: bool
+
+
+class StreamEnd(msgspec.Struct, frozen=True):
+    """Data of STALE_COMMAND of a controller: True if it holds its joints, False if a policy acts."""
+
+    held: bool
 
 
 RUN_ENDED = "the run ended"

@@ -12,6 +12,7 @@ import msgspec
 
 from dxlrun.channels.answers import Answer, Code, CommandOutcome, Completion, Refusal
 from dxlrun.channels.commands import LOOP, CommandMessage, TakenCommand
+from dxlrun.channels.event_records import StreamEnd
 from dxlrun.channels.loop_requests import (
     Cancel,
     NewCommander,
@@ -175,7 +176,8 @@ class Steering:
         for name in manager.stale(record.woken_ns) if manager.streams else ():
             if not (ends := self._stale(f"the stream of commands for {name} ended")):
                 manager.hold_controller(name)
-            self._context.events.emit_event(name, texts.stream_expired(ends or texts.JOINTS_HELD))
+            event, data = texts.stream_expired(ends or texts.JOINTS_HELD), StreamEnd(held=not ends)
+            self._context.events.emit_event(name, event, msgspec.json.encode(data))
         return count
 
     def refuse_commands(self) -> None:

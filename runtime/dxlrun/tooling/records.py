@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from dxlrun.channels.event_records import SchedulerGrant as SchedulerGrant
     from dxlrun.channels.event_records import Severity as Severity
     from dxlrun.channels.event_records import SimulationStall as SimulationStall
+    from dxlrun.channels.event_records import StreamEnd as StreamEnd
     from dxlrun.channels.logged_packets import BEFORE_FIRST_CYCLE as BEFORE_FIRST_CYCLE
     from dxlrun.channels.logged_packets import LoggedPacket as LoggedPacket
     from dxlrun.channels.ring import RING_SECONDS as RING_SECONDS
