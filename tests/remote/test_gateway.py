@@ -76,7 +76,7 @@ def test_what_the_loop_refuses_is_refused_with_its_code(desk):
 LOAD = {"name": "more", "type": "arm", "joints": ["pan"]}
 WRONG = [
     ("GET", "/nothing", None, 404, "unknown_page", "GET /nothing is not a request"),
-    ("POST", "/robot", None, 405, "wrong_method", "/robot takes no POST"),
+    ("POST", "/robot", None, 405, "wrong_method", "/robot does not support POST"),
     ("GET", "/robot/", None, 404, "unknown_page", "not a request"),
     ("POST", "/controllers/lefty/commands/go", {}, 404, "unknown_controller", "did you mean left?"),
     ("POST", "/controllers/left/commands/goo", {}, 404, "unknown_command", "did you mean go?"),
@@ -95,7 +95,7 @@ WRONG = [
     ("POST", GO, {"positions": ["x"] * 50_000}, 422, "invalid", "; and 49995 more"),
     ("POST", "/controllers/left/commands/break", {"count": 1}, 422, "invalid", "KeyError: 'a mistake of its author'"),
     ("POST", "/controllers/left/commands/leave", {"count": 1}, 422, "invalid", "SystemExit: 3"),
-    ("POST", "/controllers/left/commands/many", {"count": 40_000}, 413, "too_long", "320000 bytes are too many"),
+    ("POST", "/controllers/left/commands/many", {"count": 40_000}, 413, "too_long", "the request has 320000 bytes"),
     ("POST", "/controllers/left/set-points/many", {"count": 600}, 413, "too_long", "send the values as a command"),
     ("POST", "/controllers/spare/set-points/go", {"positions": [0]}, 409, "not_active", "not active; switch to it first"),
     ("POST", SET_POINT + "?lease=0", {"positions": [0]}, 422, "invalid", "a lease of 0 s is out of range; write 0.01 to 60 s"),

@@ -277,7 +277,7 @@ def test_live_parameters_are_checked_and_changed_together(arm):
         ({"gains.d": 1.0}, 422, "not_live", "gains.d of left cannot be changed in a run; live are speed"),
         ({"joints": "tilt"}, 422, "not_live", "joints of left cannot be changed in a run"),
         ({"sped": 1.0}, 404, "unknown_parameter", "left has no parameter sped; did you mean speed?"),
-        ({"gains": 1.0}, 404, "unknown_parameter", "name its parts: gains.p, gains.joint.pan"),
+        ({"gains": 1.0}, 404, "unknown_parameter", "name one of its values: gains.p, gains.joint.pan"),
         ({"gains.joint.tilt": 1.0}, 404, "unknown_parameter", "left has no parameter gains.joint.tilt"),
         ({"gains.p.x": 1.0}, 404, "unknown_parameter", "left has no parameter gains.p.x"),
         ({}, 422, "invalid", "nothing to change"),

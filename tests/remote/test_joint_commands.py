@@ -133,8 +133,8 @@ WRONG = [
     ),
     ("positions", "position", {"pan": 0.5}, "", 422, "pan: 0.5 has no unit"),
     ("positions", "position", {"pan": "soon"}, "", 422, "pan: 'soon' is not an angle"),
-    ("positions", "velocity", {"pan": "1 rad/s"}, "", 404, "joints of positions take position"),
-    ("whole", "velocity", {"pan": "1 rad/s"}, "", 404, "joints of whole take position"),
+    ("positions", "velocity", {"pan": "1 rad/s"}, "", 404, "positions accepts for each joint: position"),
+    ("whole", "velocity", {"pan": "1 rad/s"}, "", 404, "whole accepts for each joint: position"),
     ("whole", "positions", {"positions": ["0 deg", "0 deg"]}, "", 404, "whole has no command positions"),
     ("positions", "position", {"pan": "80 deg"}, "", 422, "pan is sent to 80 deg, outside its limits"),
     (
@@ -147,7 +147,14 @@ WRONG = [
     ),
     ("positions", "position", {"pan": "0 deg"}, "&in=2", 422, "positions moves its joints at once"),
     ("whole", "position", {"pan": "0 deg"}, "&in=0", 422, "in=0 is out of range"),
-    ("positions", "positions", {"positions": ["0 deg", "0 deg"]}, "&in=2", 422, "in is for joints by name"),
+    (
+        "positions",
+        "positions",
+        {"positions": ["0 deg", "0 deg"]},
+        "&in=2",
+        422,
+        "contains its own times; omit in=",
+    ),
     ("positions", "positions", {"positions": ["0 deg"]}, "", 422, "1 positions for 2 joints"),
     ("positions", "posvel", {"pan": "0 deg"}, "", 404, "positions has no command posvel"),
     (

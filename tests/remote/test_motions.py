@@ -167,7 +167,7 @@ WRONG = [
     (HEAD % "positions" + POINT % "pan: {position: 0}", "4:51", "0 has no unit", "60 deg"),
     ("name: nod\n", "1:1", "motions", ""),
     ("name: [\n", "1:7", "", ""),
-    (NOD + NOD.split("motions:\n")[1].split("  - controller: posvel", maxsplit=1)[0], "14:9", "this part begins before the one before", "start it later"),
+    (NOD + NOD.split("motions:\n")[1].split("  - controller: posvel", maxsplit=1)[0], "14:9", "this part begins before the end of the previous part", "start it later"),
 ]  # fmt: skip
 
 

@@ -156,7 +156,7 @@ def test_what_cannot_be_switched_does_not_reach_the_loop(arm, path, body, status
         ("/joints/pen", "there is no joint pen; did you mean pan?"),
         ("/joints/pen/registers/led", "there is no joint pen; did you mean pan?"),
         ("/joints/pan/registers/lad", "pan: an XM430-W350 has no register lad; did you mean led?"),
-        ("/joints/pan/registers/nonsense", "`dxlrun models XM430-W350` lists them"),
+        ("/joints/pan/registers/nonsense", "list the registers by `dxlrun models XM430-W350`"),
     ],
 )
 def test_what_there_is_not_cannot_be_read(arm, path, said):

@@ -111,7 +111,7 @@ def test_a_directory_that_is_not_ours_alone_is_not_used(place, tmp_path, wrong):
         place.mkdir()
         place.chmod(0o755)
         (place / "pair.sock").touch()
-    with pytest.raises(DxlrunError, match="must be a directory that only you may enter: remove it"):
+    with pytest.raises(DxlrunError, match="is not a private directory of this user; remove it"):
         create_listener("pair")
     assert running() == ()
     assert wrong != "open to others" or (place / "pair.sock").exists()
