@@ -145,7 +145,7 @@ WRONG = [
         422,
         "tilt is commanded to 1 rad/s, more than 0.25 rad/s",
     ),
-    ("positions", "position", {"pan": "0 deg"}, "&in=2", 422, "positions moves its joints at once"),
+    ("positions", "position", {"pan": "0 deg"}, "&in=2", 422, "positions moves its joints immediately"),
     ("whole", "position", {"pan": "0 deg"}, "&in=0", 422, "in=0 is out of range"),
     (
         "positions",
