@@ -1,8 +1,8 @@
 """Kept state: what a controller keeps in one run it has in the next; whatever ends, a file is old or new.
 
-CI kills a writing process 4 times and the loop of a run once, from a fixed seed. The full campaign:
+CI kills a writing process 4 times and the loop of a run once. The full campaign:
 
-    DXLRUN_KEPT_KILLS=100 python -m pytest tests/run/test_kept_state.py -q
+    pytest --campaign=release tests/run/test_kept_state.py
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 import pytest
 from msgspec.structs import replace
+from tests.kit.campaigns import campaign
 from tests.kit.stories import plugin_folder
 
 from dxlrun import ControllerFault
@@ -46,7 +47,6 @@ from dxlrun.run.kept_files import read_states, replace_file, state_directory
 from dxlrun.testing import VirtualRobot, plan_of, read_log, simulated_robot
 from dxlrun_analysis.replay import replay_log
 
-KILLS = int(os.environ.get("DXLRUN_KEPT_KILLS", "4"))
 ROBOT = """\
 name: keeper
 arguments:
@@ -401,10 +401,10 @@ for number in range(1, 1_000_000):
 """
 
 
-@pytest.mark.campaign
-def test_a_kill_while_a_file_is_written_leaves_the_old_one_or_the_new(tmp_path):
-    chance, place, last = random.Random(7), tmp_path / "a.kept", 0
-    for _ in range(KILLS):
+@campaign(ci=4, night=25, release=100)
+def test_a_kill_while_a_file_is_written_leaves_the_old_one_or_the_new(tmp_path, amount, chance):
+    place, last = tmp_path / "a.kept", 0
+    for _ in range(int(amount)):
         process = subprocess.Popen([sys.executable, "-c", WRITING, str(tmp_path)], stdout=subprocess.PIPE)
         assert process.stdout is not None
         process.stdout.readline()
@@ -420,12 +420,14 @@ def test_a_kill_while_a_file_is_written_leaves_the_old_one_or_the_new(tmp_path):
     assert last > 0
 
 
-@pytest.mark.campaign
-def test_the_loop_is_killed_at_any_time_and_the_state_stays_whole(start, robot, installed, wait_for):
+@campaign(ci=1, night=6, release=25)
+def test_a_kept_state_is_whole_when_the_loop_was_killed_at_any_time(  # noqa: PLR0917  fixtures
+    start, robot, installed, wait_for, amount, chance
+):
     robot.write_text(ROBOT.replace("size: 20000", "size: 20000, every: 10").replace("keeper", "killed"))
     place = Path(os.environ["XDG_STATE_HOME"]) / "dxlrun/killed/simulated/runs.kept"
-    chance, last = random.Random(5), 0
-    for _ in range(max(1, KILLS // 4)):
+    last = 0
+    for _ in range(int(amount)):
         running = start("--no-record", robot=robot, path=installed)
         wait_for(lambda: place.exists() and _number(place) > last, "a kept state")  # noqa: B023
         last = _number(place)

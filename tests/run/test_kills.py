@@ -3,12 +3,9 @@
 Judged by the simulated bus' ledger alone: every byte sent is a legal instruction, torque ends off on all
 servos, nothing switches it on again once it was cut. And: the log can be read, no process is left.
 
-CI runs 3 kills from a fixed seed. The full campaign before a release:
+CI runs 3 kills. The full campaign before a release; each test prints its victim and moment:
 
-    DXLRUN_KILLS=60 python -m pytest tests/run/test_kills.py -q -rA
-
-`DXLRUN_KILLS` is the number of kills, `DXLRUN_KILL_SEED` (default 1) what they are drawn from; each test's
-name tells victim and moment, and one kill runs again by that name.
+    pytest --campaign=release tests/run/test_kills.py -rA
 """
 
 from __future__ import annotations
@@ -25,7 +22,7 @@ from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
-import pytest
+from tests.kit.campaigns import campaign
 
 VICTIMS = ("run.loop_process", "run.guardian", "log.recorder", "dxlrun")
 """The terminal's own process is "dxlrun"."""
@@ -34,17 +31,6 @@ LATEST_S = {"process": 1.8, "wire": 0.5}
 end take about so long. The others from the first byte on the wire, which a slow wire keeps busy with the
 set-up."""
 Start = Callable[..., Any]
-
-
-def kills() -> list[Any]:
-    """Return victims in turn, moments at random."""
-    chance = random.Random(int(os.environ.get("DXLRUN_KILL_SEED", "1")))
-    count = int(os.environ.get("DXLRUN_KILLS", "3"))
-    drawn = []
-    for index in range(count):
-        since = chance.choice(tuple(LATEST_S))
-        drawn.append((VICTIMS[index % len(VICTIMS)], since, round(chance.uniform(0.0, LATEST_S[since]), 3)))
-    return [pytest.param(*one, id=f"{one[0]}-{one[2]}s-after-{one[1]}-{n}") for n, one in enumerate(drawn)]
 
 
 def heard(run: Any) -> bytes:
@@ -99,18 +85,19 @@ def busy_programs(count: int) -> Iterator[None]:
             program.wait()
 
 
-@pytest.mark.campaign
-@pytest.mark.parametrize(("victim", "since", "after_s"), kills())
+@campaign(ci=3, night=15, release=60)
 def test_a_kill_leaves_the_robot_limp(  # noqa: PLR0917  fixtures
     start: Start,
     tmp_path: Path,
-    victim: str,
-    since: str,
-    after_s: float,
+    number: int,
+    chance: random.Random,
     wait_for: Callable[..., Any],
     all_limp: Callable[[Any], bool],
     never_on_again: Callable[[Any], bool],
 ) -> None:
+    victim, since = VICTIMS[number % len(VICTIMS)], chance.choice(tuple(LATEST_S))
+    after_s = round(chance.uniform(0.0, LATEST_S[since]), 3)
+    print(f"kill of {victim} {after_s} s after {since}")
     robot = tmp_path / "slow.yaml"
     text = (tmp_path / "pair.yaml").read_text()
     robot.write_text(text.replace("1_000_000", "19_230").replace("rate: 50", "rate: 20"))

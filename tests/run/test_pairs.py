@@ -7,7 +7,7 @@ for which the kernel let emulator, survivors or this process wait for a processo
 
 CI runs `TELLING`, the first eight pairs. All ordered pairs, before a release:
 
-    DXLRUN_KILL_PAIRS=90 python -m pytest tests/run/test_pairs.py -q -rP
+    pytest --campaign=release tests/run/test_pairs.py -rP
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from typing import Any, NamedTuple
 
 import pytest
 from tests.kit.awaited import DEADLINE_S
+from tests.kit.campaigns import campaign
 
 from dxlrun.remote.sockets import sockets
 
@@ -41,9 +42,11 @@ MODULES = {
 IN_CONTROL = ("main", "guardian", "loop")
 SETTLED_S = 1.5
 """After it `dxlrun stop` is to end what is left, whether it would have ended by itself or not."""
-COUNT = int(os.environ.get("DXLRUN_KILL_PAIRS", "8"))
-LONGEST_MS = 1000 if COUNT >= 90 else 2500
-"""From the last hit to torque off. A survivor that waits for its timeout of 5 s is too late."""
+LONGEST_MS = {"ci": 2500, "release": 1000}
+"""From the last hit to torque off, where other tests run too, and on a quiet machine.
+
+A survivor that waits for its timeout of 5 s is too late.
+"""
 PAUSES_S = (0.0, 0.02, 0.1, 0.3)
 """Between the hits, in turn: before, while and after the first one is noticed."""
 
@@ -71,14 +74,18 @@ TELLING = (
 )
 
 
-def pairs() -> list[Any]:
-    """Return the pairs to try, the telling ones first, with the pause between their hits."""
-    ordered = ((first, second) for first in HITS for second in HITS if first != second)
-    chosen = list(dict.fromkeys((*TELLING, *ordered)))[:COUNT]
-    return [
-        pytest.param(first, second, PAUSES_S[index % len(PAUSES_S)], id=f"{first}-{second}")
-        for index, (first, second) in enumerate(chosen)
-    ]
+PAIRS = tuple(
+    dict.fromkeys((*TELLING, *((first, second) for first in HITS for second in HITS if first != second)))
+)
+"""All 90 pairs, the telling ones first."""
+
+
+@pytest.fixture
+def hits(number: int) -> tuple[Hit, Hit, float]:
+    """The pair of a test, and the pause between its hits, s."""
+    first, second = PAIRS[number]
+    print(first, second)
+    return first, second, PAUSES_S[number % len(PAUSES_S)]
 
 
 class Servos(NamedTuple):
@@ -145,14 +152,14 @@ def servos(tmp_path: Path) -> Iterator[Servos]:
 
 @pytest.fixture
 def run(
-    request: pytest.FixtureRequest,
+    hits: tuple[Hit, Hit, float],
     start: Callable[..., Any],
     servos: Servos,
     tmp_path: Path,
     wait_for: Callable[..., Any],
 ) -> Any:
     """A run of `pair` under a name of its own, once it controls the servos; a gateway only to be hit."""
-    gateway = "gateway" in request.node.callspec.id
+    gateway = "gateway" in {hit.process for hit in hits[:2]}
     robot = tmp_path / "pairs.yaml"
     text = (tmp_path / "pair.yaml").read_text().replace("latency: 1 ms", "latency: 4 ms")
     name = f"pair_{os.getpid()}"
@@ -203,11 +210,16 @@ def end_what_is_left(run: Any, wait_for: Callable[..., Any]) -> str:
     return str(err)
 
 
-@pytest.mark.campaign
-@pytest.mark.parametrize(("first", "second", "pause_s"), pairs())
-def test_one_survivor_takes_torque_off(  # noqa: PLR0917  fixtures
-    run: Any, servos: Servos, wait_for: Callable[..., Any], first: Hit, second: Hit, pause_s: float
+@campaign(ci=8, night=20, release=len(PAIRS))
+def test_one_survivor_takes_torque_off(
+    run: Any,
+    servos: Servos,
+    wait_for: Callable[..., Any],
+    hits: tuple[Hit, Hit, float],
+    amount: float,
 ) -> None:
+    first, second, pause_s = hits
+    longest_ms = LONGEST_MS["release" if amount == len(PAIRS) else "ci"]
     pids = run.processes()
     starvation = Starvation(os.getpid(), servos.pid, *(pids[MODULES[one]] for one in IN_CONTROL))
     hit_ns = 0
@@ -233,7 +245,7 @@ def test_one_survivor_takes_torque_off(  # noqa: PLR0917  fixtures
             f"TORQUE OFF after {after_ms:.0f} ms, {starved_ms:.0f} ms without a processor: "
             f"{first}, {second} {pause_s * 1e3:.0f} ms later"
         )
-        assert after_ms - starved_ms < LONGEST_MS
+        assert after_ms - starved_ms < longest_ms
     err = end_what_is_left(run, wait_for)
     assert not any(servos.torque().values())
     if (first, second) == (Hit("main", "STOP"), Hit("gateway", "STOP")):  # as `fg` shows it

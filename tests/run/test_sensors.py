@@ -2,7 +2,7 @@
 
 CI does it with the sensor's own process only; with all processes of a run, judged by its log and its servos:
 
-    DXLRUN_SENSOR_RUNS=5 python -m pytest tests/run/test_sensors.py -q
+    pytest --campaign=night tests/run/test_sensors.py
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.kit.awaited import DEADLINE_S, until
+from tests.kit.campaigns import campaign
 
 from dxlrun.channels import slot
 from dxlrun.channels.child_processes import RunMemory
@@ -175,8 +176,7 @@ def test_a_sensor_that_dies_sends_nan_or_stops_and_comes_back(tmp_path, unit, mo
     assert events[5].startswith("delivered no sample for 1")
 
 
-@pytest.mark.campaign
-@pytest.mark.parametrize("number", range(int(os.environ.get("DXLRUN_SENSOR_RUNS", "0"))))
+@campaign(ci=0, night=5, release=20)
 def test_a_sensor_that_dies_sends_nan_or_stops_costs_the_run_nothing_but_its_row(
     start, tmp_path, unit, number
 ):

@@ -5,11 +5,9 @@ by the simulated buses' ledger: the other bus goes on, one that is back is read 
 and all servos end limp: by the loop, by the guardian when the loop is killed, or by the terminal's process
 when both are.
 
-CI pulls 2 times from a fixed seed. The full campaign before a release:
+CI pulls 2 times in one run. The full campaign before a release has ten pulls in each of ten runs:
 
-    DXLRUN_UNPLUGS=100 python -m pytest tests/run/test_unplugs.py -q
-
-`DXLRUN_UNPLUG_SEED` (default 1) is what bus, moment and duration are drawn from; a run has ten of them.
+    pytest --campaign=release tests/run/test_unplugs.py
 """
 
 from __future__ import annotations
@@ -28,13 +26,15 @@ from typing import Any
 import pytest
 from tests.kit.answers import result_of
 from tests.kit.awaited import DEADLINE_S
+from tests.kit.campaigns import campaign
 
 from dxlrun.channels.event_records import EventCode
 from dxlsim.bus.ledger import LedgerEntry, read_ledger
 from dxlwire.packets import PacketKind
 
 DXLRUN = Path(sys.executable).with_name("dxlrun")
-A_RUN = 10
+MOST_PULLS = 10
+"""Of one run."""
 ENDS = {"loop": ("loop_process",), "both": ("guardian", "loop_process"), "none": ()}
 """What is killed at the end; without a loop and a guardian the terminal's process has the last hand."""
 ROBOT = """\
@@ -62,16 +62,9 @@ ON_THE_WAY = 4
 MARK = {"left": b"\xff\xff", "right": b"\xff\xff\xfd\x00"}
 
 
-def pulls() -> list[Any]:
-    """Return runs of up to ten pulls of an adapter: whose, after how long and for how long, ms."""
-    chance = random.Random(int(os.environ.get("DXLRUN_UNPLUG_SEED", "1")))
-    count = int(os.environ.get("DXLRUN_UNPLUGS", "2"))
-    drawn = [(chance.choice(NAMES), chance.randint(0, 400), chance.randint(1, 900)) for _ in range(count)]
-    runs = [drawn[at : at + A_RUN] for at in range(0, count, A_RUN)]
-    return [
-        pytest.param(run, tuple(ENDS)[number % len(ENDS)], id=f"{number}-{len(run)}-pulls")
-        for number, run in enumerate(runs)
-    ]
+def draw_pulls(chance: random.Random, count: int) -> list[tuple[str, int, int]]:
+    """Return pulls of an adapter: of which bus, after how long and for how long, ms."""
+    return [(chance.choice(NAMES), chance.randint(0, 400), chance.randint(1, 900)) for _ in range(count)]
 
 
 @dataclass
@@ -124,16 +117,19 @@ def servos(tmp_path):
     process.communicate()
 
 
-@pytest.mark.campaign
-@pytest.mark.parametrize(("drawn", "killed"), pulls())
+@campaign(ci=1, night=3, release=10)
 def test_an_adapter_that_is_pulled_costs_the_other_bus_nothing_and_comes_back(  # noqa: PLR0917  fixtures
     start: Callable[..., Any],
     servos: Servos,
     tmp_path: Path,
-    drawn: list[tuple[str, int, int]],
-    killed: str,
+    number: int,
+    amount: float,
+    chance: random.Random,
     wait_for: Callable[..., Any],
 ) -> None:
+    drawn = draw_pulls(chance, min(2 * int(amount), MOST_PULLS))
+    killed = tuple(ENDS)[number % len(ENDS)]
+    print(f"at the end, {killed} killed")
     run = start(*(f"{bus}:={link}" for bus, link in servos.links.items()), robot=tmp_path / "pulled.yaml")
     for name in NAMES:
         wait_for(lambda name=name: len(servos.of(name, "in")) > 60, f"cycles on {name}")
