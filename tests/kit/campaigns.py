@@ -83,7 +83,7 @@ class Campaigns:
         self._asked: bool = config.getoption("--campaigns")
         _LEVEL[0], _SEED[0] = self._level, self._seed
         if self._asked:
-            config.option.numprocesses = 0  # one process collects all
+            config.option.dist, config.option.tx = "no", []  # this process collects all tests
 
     def pytest_generate_tests(self, metafunc: pytest.Metafunc) -> None:
         """Make a test for each number."""
@@ -91,6 +91,7 @@ class Campaigns:
         if count is not None and "number" in metafunc.fixturenames:
             metafunc.parametrize("number", range(int(count)))
 
+    @pytest.hookimpl(tryfirst=True)  # the table also has what the change of a commit does not select
     def pytest_collection_modifyitems(self, config: pytest.Config, items: list[pytest.Item]) -> None:
         """Leave out what has a count of 0 at this level; beyond CI, campaigns have no time limit."""
         for item in items:
