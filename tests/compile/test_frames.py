@@ -47,7 +47,7 @@ def test_a_robot_without_a_urdf_has_no_frames() -> None:
         (
             '"right_arm_joint" type="continuous"',
             '"right_arm_joint" type="prismatic"',
-            "the URDF slides right_arm_joint, but positions are angles: frames show no motion; add "
+            "the URDF slides right_arm_joint, but the robot file has angles for positions: the frames of the log will not move; add "
             "travel_per_turn here, or make it revolute in the URDF and add a prismatic mimic joint",
         ),
         (
@@ -119,7 +119,9 @@ JAW = """\
         (
             "prismatic",
             "revolute",
-            ["the URDF turns jaw, but positions are lengths: frames show no motion"],
+            [
+                "the URDF turns jaw, but the robot file has lengths for positions: the frames of the log will not move"
+            ],
         ),
     ],
 )
@@ -185,9 +187,9 @@ IMUS = """\
         ("left_arm", "body", "", "none", "frame: the frame of imu is body, but unit is on left_arm: these links move relative to each other; write `frame: left_arm`, or the rotation of unit as `mounting`"),
         ("tilted", "body", "", "none", "frame: the frame of imu is body, but unit is on tilted: these links differ by 30 deg; write"),
         ("body", "tilted, mounting: [0 deg, 30 deg, 0 deg]", "", "none", "frame: the frame of imu is tilted, but unit is on body: these links differ by 60 deg with the mounting; write"),
-        ("left_arm", "left_arm", "imu, imu_link: body", "none", "imu_link: the frame of imu is left_arm, but its link is body: these links move relative to each other; write `imu_link: left_arm`"),
-        ("left_arm", "left_arm", "imu", "none", "imu: the frame of imu is left_arm, but its link is imu_link: these links move relative to each other"),
-        ("tilted", "tilted", "", "imu", "orientation: gravity uses the orientation of tilted from imu for the URDF's first link body: these links differ by 30 deg; use the orientation of an IMU on body"),
+        ("left_arm", "left_arm", "imu, imu_link: body", "none", "imu_link: imu measures in the frame left_arm, but `imu_link` is body: these links move relative to each other; write `imu_link: left_arm`"),
+        ("left_arm", "left_arm", "imu", "none", "imu: imu measures in the frame left_arm, but `imu_link` is imu_link: these links move relative to each other"),
+        ("tilted", "tilted", "", "imu", "orientation: imu measures the orientation of tilted, but gravity uses it as that of body, the URDF's first link: these links differ by 30 deg; use the orientation of an IMU on body"),
     ],
 )  # fmt: skip
 @pytest.mark.usefixtures("part_plugins")

@@ -78,11 +78,10 @@ controllers:
 
     assert errors(turning) == []
     assert errors(linear) == [
-        f"grip moves jaw, which is linear, but its {key} is of an angle"
-        for key in ("speed", "tolerance", "stall_speed")
+        f"grip has {key} as an angle, but jaw is linear" for key in ("speed", "tolerance", "stall_speed")
     ]
     assert errors(linear.replace("joint: jaw", keys)) == []
     assert errors(turning.replace("joint: jaw", "joint: jaw, tolerance: 1 mm")) == [
-        "grip moves jaw, which turns, but its tolerance is of a length"
+        "grip has tolerance as a length, but jaw turns"
     ]
     assert "unit kg" in problems_in(turning.replace("joint: jaw", "joint: jaw, tolerance: 1 kg"))[0].what

@@ -158,7 +158,7 @@ def many(samples: int, formula: str = "sin(t)") -> str:
         ),
         (
             many(90_000, "+".join(["(t + t)"] * 60)),
-            "characters of formulas to evaluate (samples x length, of all parts); 20000000 are allowed",
+            "characters of formulas (samples x length, of all parts); 20000000 are allowed",
         ),
     ],
 )

@@ -195,7 +195,7 @@ def test_bodies_that_cannot_be_moved_are_told_before_a_process_starts() -> None:
     loose = URDF.replace(
         '<link name="left"/>', '<link name="left"><inertial><mass value="-1"/></inertial></link>'
     )
-    with pytest.raises(InputError, match="MuJoCo cannot take the URDF"):
+    with pytest.raises(InputError, match="MuJoCo cannot load the URDF"):
         simulation_of(compile_text(_with_bodies(SIMULATED, loose)).plan)
 
 

@@ -218,7 +218,7 @@ def test_a_device_that_answers_only_between_the_cycles_is_asked_seldom(monkeypat
         rig.cycle()
         assert rig.states.valid.all()
     (lost, *_) = rig.events.of(EventCode.DEVICE_LOST)
-    assert "answers in idle time, but not in cycles" in lost[1]
+    assert "answers single reads, but not those of the cycles" in lost[1]
     assert len(rig.events.of(EventCode.DEVICE_LOST)) <= 3
 
 

@@ -153,7 +153,11 @@ def affordable(motion: MotionDescription, problems: Problems) -> bool:
     good = True
     for what, per_part, most in (
         ("targets (samples x joints, of all parts)", values, MOST_TARGETS),
-        ("characters of formulas to evaluate (samples x length, of all parts)", characters, MOST_CHARACTERS),
+        (
+            "characters of formulas (samples x length, of all parts)",
+            characters,
+            MOST_CHARACTERS,
+        ),
     ):
         total = sum(per_part.values())
         if total > most:

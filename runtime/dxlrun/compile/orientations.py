@@ -37,7 +37,7 @@ def check_orientations(
         key = "imu_link" if model is not None and model.imu_link else "imu"
         file.warning(
             marks.value("model", key),
-            f"the frame of {imu} is {links[imu]}, but its link is {frames.imu_link}: {turn}",
+            f"{imu} measures in the frame {links[imu]}, but `imu_link` is {frames.imu_link}: {turn}",
             f"write `imu_link: {links[imu]}`, or correct the frame of {imu}",
         )
     if frames is not None and imu:
@@ -47,8 +47,8 @@ def check_orientations(
         if state and (turn := _turn(urdf, urdf.root, links.get(source, urdf.root))):
             file.warning(
                 marks.value("controllers", name, "orientation"),
-                f"{name} uses the orientation of {links[source]} from {source} for the URDF's first link "
-                f"{urdf.root}: {turn}",
+                f"{source} measures the orientation of {links[source]}, but {name} uses it as that of "
+                f"{urdf.root}, the URDF's first link: {turn}",
                 f"use the orientation of an IMU on {urdf.root}",
             )
 

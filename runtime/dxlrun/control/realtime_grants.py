@@ -217,7 +217,7 @@ def _short_slice() -> tuple[Grant, ...]:
         return ()
     if _SCHED_ATTR.unpack(found.raw)[5] != SLICE_NS:
         return ()
-    sentence = f"time slices of {SLICE_NS / 1e6:g} ms, scheduled before longer ones"
+    sentence = f"time slices of {SLICE_NS / 1e6:g} ms, so that the process is scheduled before others"
     return (Grant("time slice", True, sentence),)
 
 

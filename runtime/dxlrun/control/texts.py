@@ -292,7 +292,7 @@ def not_numbers(size: int) -> str:
 
 
 def no_single_goal(controller: str) -> str:
-    return f"the motion's part for {controller} must be one goal, at its start"
+    return f"the motion's part for {controller} has several goals or a later one, so it has no single goal"
 
 
 def command_upper(upper: str) -> str:
@@ -324,7 +324,7 @@ def lower_not_active(controller: str) -> str:
 
 
 def lower_failed(controller: str) -> str:
-    return f"its lower controller {controller} broke its contract"
+    return f"its lower controller {controller} failed"
 
 
 # Consequences of commands that do not come any more

@@ -93,8 +93,8 @@ class BusSimulation(Form):
     )
     echo: bool = key("Echo of the host's own bytes, as with some adapters.", "true", False)
     absent: Literal["silent", "slot"] = key(
-        "Replies to a sync or bulk read after a missing servo: none (silent), or after the missing "
-        "servo's time slot (slot, Protocol 2.0 only).",
+        "Reply of servos after a missing one in a sync or bulk read: none (silent), or as soon as its time "
+        "slot is over (slot, Protocol 2.0 only).",
         "slot",
         "silent",
     )

@@ -440,7 +440,7 @@ def _indentation(error: _Error) -> str:
     if error.unindented:
         *others, last = error.unindented
         named = f"{', '.join(others)} and {last}" if others else last
-        return f"indent {named} below the name of an entry"
+        return f"write a name with a colon above {named}, and indent {named} below it"
     if isinstance(error.input, list) and error.input and all(isinstance(one, dict) for one in error.input):
         names = [one.get("name", "NAME") for one in error.input]
         return f"write `{names[0]}: {{...}}` for each entry, without `-` before it"
@@ -500,7 +500,7 @@ def _sentence_own(error: _Error) -> tuple[str, str]:
     if "what" in error.context and "fix" in error.context:
         what, fix = str(error.context["what"]), str(error.context["fix"])
     else:
-        what, _, fix = str(error.context.get("error", "the value is refused")).partition("; ")
+        what, _, fix = str(error.context.get("error", "the value is not accepted")).partition("; ")
     return f"{error.path_name}: {what}", fix or "correct it"
 
 

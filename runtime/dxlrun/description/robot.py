@@ -73,7 +73,7 @@ class Scheduler(Form):
         "auto",
     )
     reply_polling: Polling = key(
-        "Longest time of polling for a servo's reply, with at most half of a core; auto is 1 ms with "
+        "Longest time of polling for a servo's reply; it takes at most half of a core. `auto` is 1 ms and "
         "a tenth of a core. Off by default.",
         "100 us",
         0,

@@ -199,7 +199,8 @@ def test_what_hangs_from_the_imu_turns_with_it() -> None:
             "imu",
             '"base_link"',
             '"world"',
-            "the URDF has a frame world, but no fixed joint from odom to the IMU's imu_link",
+            "the URDF has the frame world, so it needs a fixed joint from odom to imu_link, the link of "
+            "the IMU",
         ),
     ],
 )

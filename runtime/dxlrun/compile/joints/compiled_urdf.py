@@ -136,7 +136,10 @@ def _check_names(
     for unit, (moves, positions, fix) in _UNLIKE.items():
         names = ", ".join(name for name in unlike if joints[name].plan.unit is unit)
         if names:
-            what = f"the URDF {moves} {names}, but positions are {positions}: frames show no motion"
+            what = (
+                f"the URDF {moves} {names}, but the robot file has {positions} for positions: the frames of "
+                "the log will not move"
+            )
             file.warning(mark, what, fix)
     for name in joints:
         mimic = drawn[name].mimic if name in drawn else None

@@ -92,9 +92,9 @@ class StateKeeper:
     def _keep(self, controller: str, state: bytes) -> None:
         """Store a state for publication. Raises ControllerFault for a wrong type or size."""
         if not isinstance(state, bytes):
-            raise ControllerFault(f"kept {type(state).__name__}, not bytes")
+            raise ControllerFault(f"returned {type(state).__name__} as its state to keep, not bytes")
         if len(state) > MOST_KEPT:
-            raise ControllerFault(f"kept {len(state)} bytes, more than {MOST_KEPT}")
+            raise ControllerFault(f"returned {len(state)} bytes as its state to keep, more than {MOST_KEPT}")
         self._waiting[controller] = self._newest[controller] = state
 
     def publish_next(self) -> None:

@@ -602,7 +602,7 @@ def _names_breach(interfaces: Interfaces) -> Breach | None:
     if asked != interfaces:
         return "returns lists in its interfaces", fix
     if wrong := [name for name in interfaces.provides if not name or "/" in name]:
-        return f"provides {', '.join(map(repr, wrong))}", "name a state as orientation.x"
+        return f"provides {', '.join(map(repr, wrong))}", "choose names without `/`, such as orientation.x"
     figures = MotorModel.__struct_fields__
     if strange := [name for name in interfaces.motors if name not in figures]:
         return f"needs unknown motor data: {', '.join(strange)}", f"choose from {', '.join(figures)}"
@@ -611,7 +611,7 @@ def _names_breach(interfaces: Interfaces) -> Breach | None:
 
 def motor_breach(needed: Sequence[str], joint: JointPlan) -> Breach | None:
     """Return the problem if a joint's motor model lacks figures that a controller needs, else None."""
-    identify = f"measure it with `dxlrun identify {joint.name}`, and name the new file"
+    identify = f"measure it with `dxlrun identify {joint.name}`, and write the new file"
     if needed and joint.motor is None:
         return (
             f"needs the motor of {joint.name}, but {joint.name} has no motor file",

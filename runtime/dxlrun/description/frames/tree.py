@@ -115,8 +115,9 @@ class FrameTree:
         fixed = next((frame.name for frame in frames if frame.name in _ABOVE_ODOM), None)
         if fixed is not None:
             raise _refused(
-                f"the URDF has a frame {fixed}, but no fixed joint from {ODOM} to the IMU's {self.imu_link}",
-                f"add this joint, or remove {fixed}",
+                f"the URDF has the frame {fixed}, so it needs a fixed joint from {ODOM} to "
+                f"{self.imu_link}, the link of the IMU",
+                f"add the joint, or remove {fixed}",
             )
         self._turned = urdf.root
         return [Frame(ODOM, "", None, "root"), Frame(urdf.root, ODOM, None, "imu"), *frames[1:]]

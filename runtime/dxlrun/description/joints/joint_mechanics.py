@@ -96,7 +96,7 @@ class SharedTolerance(GoalTolerance):
 
     alone: ClassVar[str] = "servos"
     servos: Tolerance | None = key(
-        "Largest difference between the servos, at the joint; 3 deg or 1 mm by default.",
+        "Largest difference between the joint positions of the servos; 3 deg or 1 mm by default.",
         "3 deg",
         None,
     )
@@ -155,7 +155,7 @@ class OneOfServos(ServoEntry):
     bus: str | None = key("Name of the servo's bus; the joint's by default.", "legs", None)
     model: str | None = key("Model of the servo; the joint's by default.", "MX-64", None, min_length=1)
     reference: Angle | None = key(
-        "Servo angle, from its raw 0, at the joint's zero position; the joint's reference by default.",
+        "Angle of the servo, from its tick 0, where the joint is at zero; the joint's reference by default.",
         "180 deg",
         None,
     )

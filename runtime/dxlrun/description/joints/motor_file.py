@@ -127,7 +127,7 @@ class MotorForm(Form):
         None,
     )
     position_gain: Annotated[Stiffness, Field(gt=0)] | None = key(
-        "Share of the full voltage per rad of position error and unit of the P gain.", "0.158 1/rad", None
+        "Share of the full voltage for a position error of 1 rad, at a P gain of 1.", "0.158 1/rad", None
     )
     p_gain: int | None = key(
         "Value of the P gain register during the identification; absent if the servo has no such register.",

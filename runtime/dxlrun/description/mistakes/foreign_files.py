@@ -89,10 +89,13 @@ def _kinds(data: Mapping[str, object]) -> Iterator[Kind]:
     if _has_key(data, "ros__parameters", 3) or not {"controller_manager", "/**"}.isdisjoint(data):
         yield (
             "this is a parameter file of ROS 2 (ros2_control)",
-            f"{_DRAFT}; docs/how-to/ros2.md explains how to use both",
+            f"{_DRAFT}; docs/how-to/ros2.md explains how dxlrun and ROS 2 work together",
         )
     elif not {"buses", "joints"} & data.keys() and _has_ros_type(data, 4):
-        yield "this is a parameter file of ROS", f"{_DRAFT}; docs/how-to/ros2.md explains how to use both"
+        yield (
+            "this is a parameter file of ROS",
+            f"{_DRAFT}; docs/how-to/ros2.md explains how dxlrun and ROS 2 work together",
+        )
     if {"motorgroups", "motors"} <= data.keys():
         yield (
             "this is a configuration of pypot",

@@ -345,7 +345,8 @@ class OneServo(OneNode):
         old = self.table.protocol == 1.0
         if old and keep not in (None, Reset.ALL):
             raise InputError(
-                "a factory reset of Protocol 1.0 also resets ID and baud rate; give --except nothing"
+                "a factory reset of Protocol 1.0 also resets ID and baud rate; write `--except nothing` to "
+                "allow it"
             )
         if keep is None:
             keep = Reset.ALL if old else Reset.KEEP_ID_AND_BAUD_RATE

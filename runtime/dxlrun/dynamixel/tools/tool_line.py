@@ -174,10 +174,10 @@ class ToolLine:
             PortError: The line is gone or not suitable for servos.
         """
         if self._lines is None:
-            raise LookupError("speak a protocol first")
+            raise LookupError("choose the protocol of this line first")
         (result,) = self._lines.run_programs([program])
         if result is None:
-            raise self._lines.failure or PortError(f"{self.port.name}: a program on this line did not finish")
+            raise self._lines.failure or PortError(f"{self.port.name}: an exchange did not finish")
         return result
 
     def wait_for_packets(self, duration_ns: int) -> None:

@@ -91,7 +91,7 @@ class DeviceSimulation(Form):
     """Form of `simulation` of a device: values and noise of its simulated states."""
 
     values: Numbers = key(
-        "Fixed values of states, SI units; by default the simulated quantity with the state's name, or 0.",
+        "Constant values of states, SI units; other states have the simulated quantity of their name, or 0.",
         "{force.x: 12.5}",
         {},
     )

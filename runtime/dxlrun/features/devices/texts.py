@@ -37,7 +37,7 @@ def device_lost(device: str, missed: int) -> str:
 
 @event_text(EventCode.DEVICE_LOST, Severity.ERROR)
 def device_silent_in_cycles(device: str) -> str:
-    return f"{device} answers in idle time, but not in cycles; it is probed once a second"
+    return f"{device} answers single reads, but not those of the cycles; it is probed once a second"
 
 
 @event_text(EventCode.DEVICE_LOST, Severity.ERROR)

@@ -51,7 +51,7 @@ def compile_drives(file: RobotFile, servos: Mapping[str, CompiledServo]) -> dict
 
 
 def _excluded(coupling: Coupling) -> dict[Mode, str]:
-    reason = f"transmission {coupling.name} does not coordinate its servos in this mode"
+    reason = f"transmission {coupling.name} cannot move its servos together in this mode"
     return {Mode.PWM: reason} if coupling.transmission else {}
 
 

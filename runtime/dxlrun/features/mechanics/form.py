@@ -31,7 +31,10 @@ class TransmissionServo(ServoEntry):
         "XL430-W250",
         min_length=1,
     )
-    reference: Angle = key("Servo angle, from its raw 0, with the transmission's joints at zero.", "180 deg")
+    reference: Angle = key(
+        "Angle of the servo, from its tick 0, where the transmission's joints are at zero.",
+        "180 deg",
+    )
     direction: Direction = key(
         "Sense of rotation: 1 if the transmission's input grows with the servo's angle, else -1.", "1"
     )

@@ -22,7 +22,10 @@ _LEVEL = "status_return_level"
 _LOWER = ("min_position_limit", "cw_angle_limit")
 _UPPER = ("max_position_limit", "ccw_angle_limit")
 _COMMANDED = ("controllers command it", "remove it; a controller sends it")
-_MODE = ("the interfaces of the active controllers choose the mode", "remove it; claim other interfaces")
+_MODE = (
+    "the interfaces of the active controllers choose the mode",
+    "remove it; choose other interfaces of controllers",
+)
 _ADDRESS = ("dxlrun finds the servo by it", "remove it; use `dxlrun servo` instead")
 _SECOND_ID = ("a servo with a second ID executes the goals of another servo", "remove it")
 _TICK = ("it changes the size of a tick", "remove it")
@@ -183,7 +186,7 @@ def own_reason(table: ControlTable, item: ControlItem) -> tuple[str, str] | None
         return "a reboot resets it", "remove it"
     if item.name in _ANGLE_LIMITS and table.protocol == 1.0:
         return (
-            "dxlrun sets the mode with both angle limits",
+            "dxlrun chooses the mode by both angle limits",
             "write `limits: {position: ...}` instead",
         )
     rule = item.deviation

@@ -136,7 +136,7 @@ def _check_links(
         file.error(
             mark,
             f"{name} senses the simulated body, but bus {', '.join(real)} has a real port",
-            "choose a real sensor, such as `type: ${imu}` with an argument, or use port:=sim",
+            "write a `type` of a real sensor, or run with port:=sim",
         )
     for link in links:
         if known is not None and link not in known:
