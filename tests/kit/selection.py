@@ -110,7 +110,9 @@ def long_files() -> Iterator[tuple[str, str]]:
 def add_options(parser: pytest.Parser) -> None:
     """Add the options of the selection to pytest."""
     group = parser.getgroup("selection")
-    group.addoption("--all", action="store_true", help="run the long tests as well")
+    group.addoption(
+        "--all", action="store_true", help="run the long tests as well, as campaigns beyond CI do"
+    )
     group.addoption(
         "--changed", metavar="FILE", help="file with the paths that changed: run their long tests"
     )
@@ -121,7 +123,8 @@ class Selection:
 
     def __init__(self, config: pytest.Config) -> None:
         named = config.args_source is pytest.Config.ArgsSource.ARGS
-        self._everything = named or config.getoption("--all")
+        campaigns = config.getoption("--campaigns") or config.getoption("--campaign") != "ci"
+        self._everything = named or campaigns or config.getoption("--all")
         self._left_out: Counter[str] = Counter()
         changed = config.getoption("--changed")
         if changed and not hasattr(config, "workerinput"):
