@@ -190,14 +190,14 @@ def test_the_sdist_has_every_file_of_its_folders(tmp_path: Path) -> None:
     assert {str(path) for path in files} - packed == set()
 
 
-def test_the_campaigns_are_those_of_the_table() -> None:
-    rows = re.findall(r"^\| `DXLRUN_.*", (ROOT / "tests/CAMPAIGNS.md").read_text(), re.MULTILINE)
-    named = {path for row in rows for path in re.findall(r"`(tests/[\w/]+\.py)`", row)}
-    beside = {str(Path(path).parent) for row in rows if "beside" in row for path in named if path in row}
-    texts = {str(path.relative_to(ROOT)): path.read_text() for path in ROOT.glob("tests/*/**/test_*.py")}
-    marked = {path for path, text in texts.items() if re.search(r"pytest\.mark\.campaign\b(?!\()", text)}
-    assert {path for path in marked - named if str(Path(path).parent) not in beside} == set()
-    assert named - marked == set()
+def test_variables_only_name_what_is_elsewhere() -> None:
+    """Options and marks select tests; a variable has the place of something that is not in the repository."""
+    texts = [path.read_text() for path in ROOT.glob("tests/**/*.py") if "bench" not in path.parts]
+    read = (
+        r"(?:getenv\(|environ\.get\(|environ\[)\s*\"(DXLRUN_\w+)\"|\"(DXLRUN_\w+)\" (?:not )?in os\.environ"
+    )
+    names = {name for text in texts for pair in re.findall(read, text) for name in pair if name}
+    assert names == {"DXLRUN_BAM_RECORDINGS", "DXLRUN_ROS2_PYTHON"}
 
 
 def test_each_fragment_of_the_changelog_is_one_that_towncrier_takes() -> None:
