@@ -79,7 +79,7 @@ class GoalLayout(msgspec.Struct, frozen=True):
         for place in (self.position, self.speed, self.effort, self.pwm):
             if place is not None:
                 return place
-        raise LookupError("the block has no goal")
+        raise LookupError("this goal layout has no goal register")
 
 
 class TorqueLimit(msgspec.Struct, frozen=True):

@@ -48,5 +48,6 @@ def mode_of(names: Collection[str]) -> Mode:
     """
     mode = _MODES.get(frozenset(names))
     if mode is None:
-        raise ValueError(f"no servo mode combines {' and '.join(names) or 'no interfaces'}")
+        combined = f"combines {' and '.join(names)}" if names else "has no interface"
+        raise ValueError(f"no servo mode {combined}")
     return mode

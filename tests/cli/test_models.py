@@ -76,7 +76,7 @@ def test_the_motor_that_is_simulated_is_reported_with_its_source(dxlrun):
         "simulated   no-load speed 68.76 rpm, time constant 15.1 ms, friction 0.1 Nm and 8% of the torque, "
         "1.63 Nm/A",
         "  source    Rhoban BAM, bam/params/mx64/m3.json",
-        "P gain      0.158 of full duty per rad of error and unit",
+        "P gain      0.158 of full duty per rad of error, at a gain of 1",
         "  source    Rhoban BAM, bam/dynamixel/actuator.py: 0.158, 5.06 at the P gain of 32",
     ]
     scaled = dxlrun("models", "XM430-W350").out.splitlines()[3:5]

@@ -273,7 +273,7 @@ FAULT = EventGroup(EventCode.CONTROLLER_FAULT, Severity.ERROR, "head", 1, 5_100_
         (
             {"events": EventTotals((TAKEOVER,), started_ns=5_000_000_000)},
             0,
-            "at 0.1 s reflex triggered a takeover: it falls; ran for 2.0 s.",
+            "at 0.1 s reflex took over the robot: it falls; ran for 2.0 s.",
             "0 of 100 periods skipped.",
         ),
         ({"events": EventTotals((FAULT,))}, 1, "ran for 2.0 s.", "head: head: nan."),
@@ -360,10 +360,11 @@ def test_a_controller_with_a_fallback_may_fail(torso: Path):
     taken = [structs.replace(one, fallback="hold") for one in plan.loop.controllers]
     caught = structs.replace(plan, loop=structs.replace(plan.loop, controllers=tuple(taken)))
     verdict = run_verdict(structs.replace(GOOD, events=EventTotals((group(failing.name),))), caught)
-    assert (verdict.exit_code, f"{failing.name} failed and fell back;" in verdict.line) == (0, True)
+    reported = f"{failing.name} failed, and a fallback controller took over;"
+    assert (verdict.exit_code, reported in verdict.line) == (0, True)
     refused = structs.replace(GOOD, reason="fault", events=EventTotals((group(failing.name),)))
     verdict = run_verdict(refused, caught)
-    assert (verdict.exit_code, "fell back" in verdict.line) == (1, False)
+    assert (verdict.exit_code, "fallback" in verdict.line) == (1, False)
 
 
 def test_a_traceback_with_any_bytes_reaches_the_end_of_the_run():

@@ -167,7 +167,7 @@ def test_a_backup_goes_into_a_file_and_back_into_another_servo(one, tmp_path, mo
     path = tmp_path / "servo.json"
     servo(1, "set", "return_delay_time", "20", "--yes", *words)
     servo(1, "set", "temperature_limit", "60", "--yes", *words)
-    assert f"registers are in {path}" in servo(1, "backup", path, *words).out
+    assert f"registers saved in {path}" in servo(1, "backup", path, *words).out
     kept = json.loads(path.read_text())
     assert (kept["model"], kept["id"], kept["registers"]["return_delay_time"]) == (model, 1, 20)
     assert "cannot be written (it exists)" in servo(1, "backup", path, *words).err

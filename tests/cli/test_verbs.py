@@ -155,6 +155,6 @@ def test_a_verb_whose_package_is_absent_names_the_line_that_installs_it(
     said = dxlrun(verb, "run.mcap")
     assert said.code == 2
     assert said.errors == [
-        f"dxlrun: `dxlrun {verb}` needs the package {package}, and its import failed; "
-        f"install it in the source folder of dxlrun: `pip install {place}`"
+        f"dxlrun: `dxlrun {verb}` needs the package {package}, whose import failed; "
+        f"run `pip install {place}` in a clone of dxlrun"
     ]

@@ -250,7 +250,7 @@ def test_the_host_that_talks_into_a_chain_ends_it(make_line2):
     line.bus.receive_bytes(b"\x55", start + 400_000)
     received = line.receive()
     assert len(received) == 13
-    assert any("the following servos do not reply" in note for note in line.notes())
+    assert any("the servos after it in the chain do not reply" in note for note in line.notes())
 
 
 def test_two_servos_with_one_id_garble_their_turn_and_break_the_chain(make_line2):

@@ -130,7 +130,7 @@ def test_a_damaged_message_is_left_out_and_the_others_are_read(rows: Any, data: 
     [
         ("B b\n=====\nMSG: a/B\nA back\n=====\nMSG: a/A\nB there\n", "contains itself"),
         ("wstring x\n", "the type wstring of x is not defined"),
-        ("uint8 X\n", "cannot lay out"),
+        ("uint8 X\n", "cannot parse"),
     ],
 )
 def test_a_definition_that_cannot_be_laid_out_is_refused(text: str, sentence: str) -> None:
@@ -291,10 +291,10 @@ def test_what_is_not_there_is_named(path: Path) -> None:
         (
             "json",
             "jsonschema",
-            "messages of /x are json with schema jsonschema; dxlrun reads only cdr with ros2msg",
+            "messages of /x have the encoding 'json' and a schema in 'jsonschema'; dxlrun reads only 'cdr'",
         ),
-        ("cdr", "ros2idl", "messages of /x are cdr with schema ros2idl"),
-        ("cdr", "ros2msg", "messages of /x cannot be read: a/msg/X: not CDR, little-endian"),
+        ("cdr", "ros2idl", "messages of /x have the encoding 'cdr' and a schema in 'ros2idl'"),
+        ("cdr", "ros2msg", "messages of /x cannot be read: a/msg/X: the bytes are not little-endian CDR"),
     ],
 )
 def test_messages_in_another_encoding_are_refused_with_a_sentence(

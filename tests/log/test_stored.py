@@ -85,7 +85,7 @@ def test_a_run_deletes_only_what_its_robot_file_says(logs: Path, monkeypatch: py
     assert last.exists()
     monkeypatch.setattr(cli_run, "_MOST_DELETED", 0)
     lines = _disk_lines(logs / "a_20260104_000000.mcap", RecordingPlan(keep_bytes=0))
-    assert lines == [f"deleted the 1 oldest log in {logs}: recording.keep"]
+    assert lines == [f"deleted the 1 oldest log in {logs} because of `recording: {{keep: ...}}`"]
 
 
 def test_a_run_names_the_size_of_its_log_and_keeps_what_its_robot_file_says(

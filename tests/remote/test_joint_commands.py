@@ -133,8 +133,8 @@ WRONG = [
     ),
     ("positions", "position", {"pan": 0.5}, "", 422, "pan: 0.5 has no unit"),
     ("positions", "position", {"pan": "soon"}, "", 422, "pan: 'soon' is not an angle"),
-    ("positions", "velocity", {"pan": "1 rad/s"}, "", 404, "positions accepts for each joint: position"),
-    ("whole", "velocity", {"pan": "1 rad/s"}, "", 404, "whole accepts for each joint: position"),
+    ("positions", "velocity", {"pan": "1 rad/s"}, "", 404, "positions accepts position for each joint"),
+    ("whole", "velocity", {"pan": "1 rad/s"}, "", 404, "whole accepts position for each joint"),
     ("whole", "positions", {"positions": ["0 deg", "0 deg"]}, "", 404, "whole has no command positions"),
     ("positions", "position", {"pan": "80 deg"}, "", 422, "pan is sent to 80 deg, outside its limits"),
     (

@@ -141,7 +141,7 @@ def _nothing(recording: _Recording, playable: Sequence[str], what: What | None, 
 def _moments(message: _PositionMessage) -> _Moments:
     what, codec = _TYPES[message.type]
     if message.data[: len(_CDR)] != _CDR:
-        raise ValueError(f"{message.topic} is not CDR, little-endian")
+        raise ValueError(f"the bytes of {message.topic} are not little-endian CDR")
     values = codec.unpack(ENCAPSULATION + message.data[len(ENCAPSULATION) :])
     start_ns = _time_ns(cast("Mapping[str, object]", values["header"])["stamp"]) or message.t_ns
     names = cast("Sequence[str]", values["name" if what == "states" else "joint_names"])

@@ -74,4 +74,4 @@ def version() -> str:
     from dxlrun.channels.c_sources import missing
 
     why = missing()
-    return f"{metadata.version('dxlrun')}, {f'but {why}' if why else 'with the compiled kernel'}"
+    return f"{metadata.version('dxlrun')}, {f'but {why}' if why else 'with its compiled parts'}"

@@ -220,8 +220,8 @@ def known_file(robot: Path) -> None:
         raise InputError(f"robot file {word} not found; {_other_file(robot)}")
     if package := verb_registry.package_of(word):
         raise InputError(
-            f"`dxlrun {word}` needs the package {package}, and its import failed; install it in the source "
-            f"folder of dxlrun: `pip install {verb_registry.source_of(package)}`"
+            f"`dxlrun {word}` needs the package {package}, whose import failed; run `pip install "
+            f"{verb_registry.source_of(package)}` in a clone of dxlrun"
         )
     if (named := robot.with_suffix(".yaml")).is_file():
         raise InputError(f"file {word} not found; write `{named}`")

@@ -281,7 +281,8 @@ def _disk_lines(log: Path, recording: RecordingPlan) -> list[str]:
             lines.append(f"{one.path} is kept: {error.strerror or error}")
         else:
             deleted += 1
-            lines.append(f"deleted {one.path} ({decimal(one.bytes)}): recording.keep")
+            lines.append(f"deleted {one.path} ({decimal(one.bytes)}) because of `recording: {{keep: ...}}`")
     if len(lines) > _MOST_DELETED:
-        lines = [f"deleted the {counted(deleted, 'oldest log', 'oldest logs')} in {folder}: recording.keep"]
+        logs = counted(deleted, "oldest log", "oldest logs")
+        lines = [f"deleted the {logs} in {folder} because of `recording: {{keep: ...}}`"]
     return lines

@@ -476,7 +476,7 @@ class ControllerGraph:
             what = f"the fallback {other.name} of {name} is active from the start"
             fix = f"write active: false in {other.name}"
             yield Mistake(at, what, fix)
-        elif plan.active and not {name, other.name} & self._incomplete:
+        elif plan.active and not {name, other.name} & self._incomplete and not circles(self.controllers):
             yield from self._taking_over(plan, other, at)
 
     def _taking_over(self, plan: ControllerPlan, fallback: ControllerPlan, at: KeyPath) -> Iterator[Mistake]:

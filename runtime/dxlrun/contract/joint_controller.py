@@ -224,8 +224,8 @@ def _field(shown: str, name: str, kind: object, default: object) -> tuple[object
         create_model(name, **probe)
     except PydanticUserError:
         raise TypeError(
-            f"{shown} has the type {getattr(kind, '__name__', kind)}, but a key of a robot file cannot; "
-            "write float, int, bool, str, Angle, Frequency ..."
+            f"{shown} has the type {getattr(kind, '__name__', kind)}, which a key of a robot file cannot "
+            "have; write float, int, bool, str, Angle, Frequency ..."
         ) from None
     plain = get_args(kind)[0] if get_origin(kind) is Annotated else kind
     if plain not in (float, int, bool):

@@ -219,8 +219,8 @@ class LogReader:
             raise LogError(f"{self.path}: no topic {topic}; {suggestion(topic, names)}")
         if known.encoding != "cdr" or known.schema_encoding != schemas.SCHEMA_ENCODING:
             raise LogError(
-                f"{self.path}: messages of {topic} are {known.encoding or 'nothing'} with schema "
-                f"{known.schema_encoding or 'none'}; dxlrun reads only cdr with ros2msg"
+                f"{self.path}: messages of {topic} have the encoding {known.encoding!r} and a schema in "
+                f"{known.schema_encoding!r}; dxlrun reads only 'cdr' with 'ros2msg'"
             )
         try:
             return ColumnReader(known.type)

@@ -86,7 +86,7 @@ class Codec:
         Raises ValueError when the bytes are not a message of this type.
         """
         if bytes(data[:_HEAD]) != ENCAPSULATION:
-            raise ValueError(f"{self.message.name}: not CDR, little-endian")
+            raise ValueError(f"{self.message.name}: the bytes are not little-endian CDR")
         try:
             value, _ = self._read(memoryview(data), _HEAD)
         except struct.error as error:
@@ -251,7 +251,7 @@ def _text() -> tuple[Write, Read]:
         (length,) = _LENGTH.unpack_from(data, at)
         at += 4
         if at + length > len(data) or not length:
-            raise ValueError("a text is longer than its message, or empty without its zero byte")
+            raise ValueError("a text is longer than its message, or lacks its final zero byte")
         return bytes(data[at : at + length - 1]).decode(errors="replace"), at + length
 
     return write_text, read_text

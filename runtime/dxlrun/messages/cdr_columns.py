@@ -224,7 +224,7 @@ class ColumnReader:
         padded = np.concatenate((data, np.zeros(_SPARE, np.uint8)))
         known = (padded[start[rows]] == ENCAPSULATION[0]) & (padded[start[rows] + 1] == ENCAPSULATION[1])
         if len(rows) and not known.any():
-            raise ValueError(f"{self.message.name}: not CDR, little-endian")
+            raise ValueError(f"{self.message.name}: the bytes are not little-endian CDR")
         rows = rows[known]
         wanted = None if fields is None else frozenset(fields)
         while True:

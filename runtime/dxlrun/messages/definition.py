@@ -111,7 +111,7 @@ def parse(message: MessageType) -> dict[str, tuple[MessageField, ...]]:
             elif text and not _CONSTANT.match(text):
                 match = _FIELD.match(text)
                 if match is None:
-                    raise ValueError(f"{message.name}: cannot lay out {line!r}")
+                    raise ValueError(f"{message.name}: cannot parse {line!r}")
                 kind, many, bound, length, field = match.groups()
                 fixed = 0 if bound else int(length or 0)
                 fields.append(MessageField(field, _full_kind(kind, name), bool(many) and not fixed, fixed))

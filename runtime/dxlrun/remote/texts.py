@@ -107,7 +107,8 @@ def value_not_finite(controller: str, kind: str, joint: str, value: object) -> s
 
 
 def quantities_of_joints(controller: str, quantities: Sequence[str]) -> str:
-    return f"{controller} accepts for each joint: {', '.join(quantities) or 'no values by name'}"
+    accepted = ", ".join(quantities) or "no values by name"
+    return f"{controller} accepts {accepted} for each joint"
 
 
 def value_not_known(joint: str, quantity: str) -> str:
@@ -147,7 +148,7 @@ def not_commandable(command: str, commander: str, able: str) -> str:
         able: Controller that would take values; empty: none.
     """
     by = (
-        f"commanded by {commander}, but not by values from clients"
+        f"commanded by {commander}, and clients cannot send values for it"
         if commander
         else "commanded by no controller"
     )
@@ -174,7 +175,7 @@ def name_too_long(longest: int) -> str:
 
 
 def active_at_once(controller: str) -> str:
-    return f"{controller} cannot be active at once; load it, then switch to it"
+    return f"{controller} cannot become active as it is loaded; load it first, then switch to it"
 
 
 def parameter_parts(parts: Sequence[str]) -> str:

@@ -416,7 +416,7 @@ class Guardian:
 
     def _report_unsupervised(self) -> None:
         """Log that the supervisor is dead or stopped, so that nobody else can end the run."""
-        what = "left the run" if self._control.closed else "was suspended (such as by Ctrl-Z)"
+        what = "has exited" if self._control.closed else "was suspended (such as by Ctrl-Z)"
         self._unsupervised = (
             f"the supervisor (process {self._job.supervisor}) {what}; the loop was asked to stop"
         )

@@ -114,8 +114,7 @@ def _looked_at(heartbeat: Heartbeat) -> Callable[[str], None]:
         if more > 0:
             raise PlugInError(
                 f"plug-in {name} started {counted(more, 'more thread', 'more threads')} in the loop's "
-                "process, and threads delay the loop's cycles; work in on_configure without threads, or "
-                "start a separate process"
+                "process, which delay its cycles; start no threads there, or start a separate process"
             )
 
     return check_import

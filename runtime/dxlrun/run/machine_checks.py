@@ -437,7 +437,7 @@ def _cores(machine: Machine) -> CheckResult:
     if machine.cores < 2:
         return check.worse(
             "one core for all processes",
-            "use a machine with two cores or more, or allow them to this process",
+            "use a machine with two cores or more, or allow this process to use two",
         )
     isolated = machine.read_text("sys/devices/system/cpu/isolated")
     also = f"; isolated: {isolated} (write them in loop.scheduler.cores for the loop)" if isolated else ""

@@ -58,11 +58,11 @@ class Duty(Enum):
     """Action of a process when others are silent."""
 
     NONE = "nothing"
-    STOP_LOOP = "ask the loop to stop: it ends by on_exit"
+    STOP_LOOP = "ask the loop to stop; it ends as `on_exit` requires"
     KILL_LOOP = "kill the loop, and switch torque off in its place"
-    KILL_GUARDIAN = "kill the guardian: Linux then asks the loop to stop, which ends by on_exit"
+    KILL_GUARDIAN = "kill the guardian, so that Linux asks the loop to stop; it ends as `on_exit` requires"
     KILL_BOTH = "kill guardian and loop, and switch torque off in their place"
-    END = "end the run by on_exit"
+    END = "end the run as `on_exit` requires"
 
 
 _DUTIES: Mapping[Set[WatchedProcess], tuple[WatchedProcess | None, Duty]] = {

@@ -153,10 +153,12 @@ def run_verdict(run: RunSummary, plan: Plan) -> RunVerdict:
             verb = "" if what != "lost" else "was " if len({one.source for one in of}) == 1 else "were "
             happened.append(f"{named(one.source for one in of)} {verb}{what} at {after_s:.1f} s")
     if fell_back:
-        happened.append(f"{named(one.source for one in fell_back)} failed and fell back")
+        happened.append(
+            f"{named(one.source for one in fell_back)} failed, and a fallback controller took over"
+        )
     for one in taken_over:
         after_s = max(one.t_ns - events.started_ns, 0) / 1e9
-        happened.append(f"at {after_s:.1f} s {one.source} triggered a takeover: {last_line(one)}")
+        happened.append(f"at {after_s:.1f} s {one.source} took over the robot: {last_line(one)}")
     ran_ns = (run.cycles + run.skipped) * loop.period_ns
     happened.append(f"ran for {ran_ns / 1e9:.1f} s")
     if events.goals.asked:

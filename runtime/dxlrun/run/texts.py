@@ -49,7 +49,7 @@ def supervisor_gone(sentence: str) -> str:
 
 @event_text(EventCode.GUARDIAN, Severity.ERROR)
 def loop_unwatched() -> str:
-    return "neither the supervisor nor the guardian responds: the run ends by on_exit; start it again"
+    return "neither the supervisor nor the guardian responds: the run ends as `on_exit` requires"
 
 
 @event_text(EventCode.SIMULATION_STALLED, Severity.WARNING)

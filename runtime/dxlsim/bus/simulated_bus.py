@@ -338,7 +338,7 @@ class SimulatedBus:
         elif group.has_slots:
             self._send_turns(group, max(each.due_ns, each.turn_end_ns))
         else:
-            self.add_note("broken reply: the following servos do not reply")
+            self.add_note("broken reply: the servos after it in the chain do not reply")
             self._group = None
 
     def _withdraw_waiting(self) -> None:
@@ -453,7 +453,7 @@ class SimulatedBus:
             if sent and not plain:
                 return
             if not sent and not group.has_slots:
-                self.add_note(f"servo {turn.servo_id} does not reply, so the following servos do not reply")
+                self.add_note(f"servo {turn.servo_id} does not reply, nor do those after it in the chain")
                 break
             sent_any = sent_any or sent
             free_ns = due_ns if sent else end_ns

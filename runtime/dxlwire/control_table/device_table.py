@@ -45,7 +45,7 @@ CAPABILITIES: Mapping[str, str] = {
         for name in ("bulk_read", "bulk_write", "fast_sync_read", "reboot", "sync_read", "sync_write")
     },
     "broadcast_ping": "a reply to a ping to all IDs",
-    WAITS: "in a sync or bulk read, a missing status before its own blocks the device",
+    WAITS: "no reply in a sync or bulk read after a device that does not reply",
 }
 """Words that a device's data file may list under `capabilities`, with their meaning. Every device supports
 ping, read and write."""
@@ -206,7 +206,7 @@ def _check_item(item: ControlItem) -> None:
     if item.encoding == "float32" and (item.initial or item.safe):
         raise ValueError(f"{item.name}: initial and safe value of a float32 must be 0")
     if item.state == "age":
-        raise ValueError(f"{item.name}: the state name age is reserved")
+        raise ValueError(f"{item.name}: the state name `age` is reserved")
     if item.scale == 0:
         raise ValueError(f"{item.name}: the tick must not be 0")
     if not STATE_NAME.fullmatch(item.state):

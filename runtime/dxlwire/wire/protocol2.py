@@ -90,7 +90,7 @@ _NUMBERS: Mapping[int, str] = {
     ErrorNumber.RANGE: "data range error: a written value is out of the range of the control table",
     ErrorNumber.LENGTH: "data length error: fewer bytes than the item needs",
     ErrorNumber.LIMIT: "data limit error: a written value is beyond a limit set in the servo",
-    ErrorNumber.ACCESS: "access error: the address cannot be written or read, or EEPROM while torque is on",
+    ErrorNumber.ACCESS: "access error: the address cannot be accessed, or is in EEPROM and torque is on",
 }
 
 

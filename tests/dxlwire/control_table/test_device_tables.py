@@ -92,7 +92,7 @@ def test_a_table_without_a_model_number_is_one_that_is_not_checked() -> None:
         ("maximum = 7", "maximum = 256", "lamp: 0..256 does not fit into its bytes"),
         ('access = "RW"', 'access = "R"', "lamp: a safe value needs a writable item in RAM"),
         ('"force.z"', '"force z"', "pressure: 'force z' is not a state name (letters"),
-        ('"force.z"', '"age"', "pressure: the state name age is reserved"),
+        ('"force.z"', '"age"', "pressure: the state name `age` is reserved"),
         ("protocol = 2.0", "protocol = [2.0]", "protocol must be 1.0 or 2.0, not [2.0]"),
         ('"-0.1 mN"', '"1/0 mN"', "pressure: tick: '1/0 mN' divides by 0"),
         ('"2 N"', '"inf N"', "pressure: offset: 'inf N' is not a finite number"),

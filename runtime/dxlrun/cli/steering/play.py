@@ -96,7 +96,7 @@ def _check(motions: Sequence[str], loop: int, *, listed: bool, wait: bool) -> No
     if not 1 <= loop <= MOST_LOOPS:
         raise InputError(f"--loop {loop} is not a number of repetitions; give 1 to {MOST_LOOPS}")
     if not wait and loop * len(motions) > 1:
-        raise InputError("--no-wait can start only one motion; omit it")
+        raise InputError("--no-wait can start only one motion; omit --no-wait")
     for motion in motions:
         path = Path(motion)
         if not path.is_file() and (path.suffix or path.name != motion):

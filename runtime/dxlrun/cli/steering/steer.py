@@ -199,7 +199,7 @@ def take_over(*, chosen: RobotChoice = ONLY_ONE) -> int:
     """
     with connect_robot(chosen.robot, "take-over") as robot:
         done = robot.take_over()
-        return report_done(robot, chosen, done, f"{robot.name} is commanded from here")
+        return report_done(robot, chosen, done, f"{robot.name} now takes commands from this computer only")
 
 
 def pause(*, chosen: RobotChoice = ONLY_ONE) -> int:

@@ -364,7 +364,7 @@ def _simulated(motor: Motor) -> Iterator[tuple[str, str]]:
     yield "simulated", ", ".join(known)
     yield "  source", motor.source
     if motor.p_gain_duty:
-        yield "P gain", f"{motor.p_gain_duty:.4g} of full duty per rad of error and unit"
+        yield "P gain", f"{motor.p_gain_duty:.4g} of full duty per rad of error, at a gain of 1"
         yield "  source", motor.gain_source
 
 

@@ -286,7 +286,7 @@ def _backup(one: OneServo, asked: VerbCall) -> Iterable[str]:
     path = Path(asked.words[0])
     backup = servo_backup.stamped(one.table, one.found.firmware, address, asked.registers)
     servo_backup.write_backup(path, backup)
-    return (f"{len(asked.registers)} registers are in {path}",)
+    return (f"{len(asked.registers)} registers saved in {path}",)
 
 
 def _new_file(asked: VerbCall) -> None:
@@ -303,7 +303,8 @@ def _restore(one: OneServo, asked: VerbCall) -> Iterable[str]:
     backup = servo_backup.read_backup(path)
     target = servo_backup.registers_to_restore(path, backup, one.table)
     if backup.firmware != one.found.firmware:
-        print_warning(f"{path} was made with firmware {backup.firmware}; this servo has {one.found.firmware}")
+        firmware = f"firmware {backup.firmware}, but this servo has {one.found.firmware}"
+        print_warning(f"{path} was saved from {firmware}; compare the settings afterwards")
     return one.restore(target, path, asked.confirmed)
 
 
