@@ -98,7 +98,7 @@ def test_a_robot_that_only_lives_in_simulation_has_nobody_to_look_at(tmp_path, c
         ROBOT.replace("PORT", "sim").replace("REGISTERS", "led: 1").replace("auto", "XM430-W350")
     )
     assert main(["check", str(robot), "--online"]) == 2
-    assert "every bus of pair is simulated" in capsys.readouterr().err
+    assert "all buses of pair are simulated" in capsys.readouterr().err
 
 
 def test_its_packets_are_a_log_when_one_is_named(check, tmp_path, capsys):
@@ -117,7 +117,7 @@ def test_its_packets_are_a_log_when_one_is_named(check, tmp_path, capsys):
     assert sum(one.kind == PacketKind.STATUS for one in read.packets) >= 4
     assert read.complete
     assert main(["analyze", str(log)]) == 0
-    assert "--online`, no run" in capsys.readouterr().out
+    assert "--online`, not a run" in capsys.readouterr().out
     before = log.read_bytes()
     code, _, err, sent = check("position_p_gain: 800", "--log", str(log), robot_text=two)
     assert (code, sent, log.read_bytes()) == (2, [], before)
@@ -138,7 +138,7 @@ def test_a_log_without_online_is_refused(tmp_path, capsys):
 def test_settings_that_another_program_left_are_a_table_with_what_they_do(check):
     before = ("1", "set", "pwm_limit", "400", "--yes")
     code, out, err, _ = check("position_p_gain: 800", "wrist_led:=0", "--debug", before=before)
-    table = [line.split() for line in out[out.index("Settings that are not") :].splitlines()]
+    table = [line.split() for line in out[out.index("Settings that differ") :].splitlines()]
     assert any(row[:1] == ["elbow"] and "pwm_limit" in row for row in table), out
     assert "limits the PWM" in out
     assert "1 difference\n" in out

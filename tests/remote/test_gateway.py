@@ -200,10 +200,10 @@ def test_what_is_no_quantity_stays_as_it_was_written():
 def test_efforts_and_pwm_are_numbers_and_text_there_is_explained():
     assert plain(positions=["0 deg"], efforts=[0.1]) == {"positions": [0.0], "efforts": [0.1]}
     with pytest.raises(
-        RefusedRequest, match=r"efforts.*'100 mA' is text; write the number in what the model"
+        RefusedRequest, match=r"efforts.*'100 mA' is text; write a number in the model's unit"
     ):
         plain(efforts=["100 mA"])
-    with pytest.raises(RefusedRequest, match=r"pwm.*'20 %' is text; write the fraction of the full voltage"):
+    with pytest.raises(RefusedRequest, match=r"pwm.*'20 %' is text; write a fraction of the full voltage"):
         plain(pwm=["20 %"])
 
 

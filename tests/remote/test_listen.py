@@ -296,7 +296,7 @@ def test_messages_come_live_until_the_run_ends_and_are_all_in_the_log(
                 with dxlrun.connect() as other:
                     other.stop(wait=False)
     code, said = running.wait(DEADLINE_S), (tmp_path / "stderr").read_text()
-    assert code == 0 or "stood still" in said, said  # the machine may have had no processor for it
+    assert code == 0 or "did not respond" in said, said  # the machine may have had no processor for it
     (log,) = (tmp_path / "logs").glob("*.mcap")
     topic = read_log(log).topics["/count/state"]
     assert topic.column("number").tolist() == [*range(len(topic.data) - 1), -1]

@@ -293,7 +293,7 @@ def test_addresses(monkeypatch, tmp_path):
     assert places == [(3, 8), (4, 8)]
     (tmp_path / "dxlrun" / "robots.yaml").write_text("robots: {torso: 'lab3:7660', b: 'c@lab4:1'}")
     assert known_robots() == {"torso": ("torso", "lab3", 7660), "b": ("c", "lab4", 1)}
-    with pytest.raises(InputError, match="is missing; `dxlrun keys "):
+    with pytest.raises(InputError, match="is missing; make it on the robot's computer by `dxlrun keys "):
         connect("torso")
 
 

@@ -138,5 +138,5 @@ def test_with_a_runtime_directory_it_is_the_only_one(place, monkeypatch):
 
 
 def test_a_name_that_is_too_long_is_refused_in_plain_words():
-    with pytest.raises(DxlrunError, match="too long for a socket: give the robot a shorter name"):
+    with pytest.raises(DxlrunError, match="too long for a socket; give the robot a shorter name"):
         create_listener("a" * 100)

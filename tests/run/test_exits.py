@@ -96,7 +96,7 @@ def test_a_guardian_that_dies_while_the_loop_loads_takes_it_along(start, tmp_pat
     os.kill(run.child("dxlrun.run.guardian"), signal.SIGKILL)
     code, _, err = run.finish()
     assert code == 1
-    assert "guardian ended" in err
+    assert "guardian exited" in err
     assert seen(ledger) == b""
 
 
@@ -117,7 +117,7 @@ CONFIRMED = "torque off was confirmed by all 2 servos"
 @pytest.mark.parametrize(
     ("happens", "said"),
     [
-        ([(GUARDIAN, KILL)], ("guardian ended",)),
+        ([(GUARDIAN, KILL)], ("guardian exited",)),
         (
             [(GUARDIAN, STOP), (LOOP, STOP), (GUARDIAN, KILL)],  # a hung loop without a guardian
             ("the loop did not stop and was killed", CONFIRMED),

@@ -253,7 +253,9 @@ def test_a_file_that_cannot_be_used_is_left_out_with_one_event(robot, tmp_path, 
     data, why = damaged(place.read_bytes())[how]
     place.write_bytes(data)
     assert number(run(robot, kept, log)) == 0
-    assert said(log) == [(Severity.WARNING, f"starts without its kept state: its file {why} ({place})")]
+    assert said(log) == [
+        (Severity.WARNING, f"starts without its kept state: the state's file {why} ({place})")
+    ]
     assert opened_file(place.read_bytes(), "runs")[0].startswith(b"00000001"), "a good one takes its place"
 
 
@@ -369,7 +371,10 @@ def test_a_controller_that_comes_again_has_what_it_kept_last():
 
 @pytest.mark.parametrize(
     ("state", "why"),
-    [(bytes(MOST_KEPT + 1), "1048577 bytes; 1048576 is the most"), (bytearray(3), "bytearray")],
+    [
+        (bytes(MOST_KEPT + 1), "1048577 bytes as its state to keep, more than 1048576"),
+        (bytearray(3), "bytearray"),
+    ],
 )
 def test_what_cannot_be_kept_is_the_controllers_fault(state, why):
     _, keep = keeping(_Sink()).open_state(controller("a"), {})

@@ -88,7 +88,7 @@ def test_an_interrupt_takes_the_robot_to_its_pose_and_holds_it_there(holding, al
     run.signal(signal.SIGINT)
     code, _, err = run.finish()
     assert code == 130
-    assert "torque stays on, as the policy says" in err
+    assert "torque stays on by the policy" in err
     assert "--take-over" in err
     assert goals(run)[-1] == 716
     assert not all_limp(run)
@@ -100,7 +100,7 @@ def test_the_guardian_holds_a_robot_whose_loop_is_gone_when_the_policy_is_hold(h
     code, _, err = run.finish()
     assert code == 1
     assert "the loop's process exited unexpectedly (signal SIGKILL)" in err
-    assert "torque stays on, as the policy says" in err
+    assert "torque stays on by the policy" in err
     assert not all_limp(run)
 
 

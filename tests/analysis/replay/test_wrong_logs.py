@@ -27,8 +27,8 @@ def test_nothing_is_compared_behind_a_gap(pair_log: Path, changed: Changed) -> N
     report = replay_log(changed(pair_log, without(*range(20, 25)), gaps=[("loop/cycles", 5)]))
     assert (report.cycles, report.compared, report.same) == (45, 20, True)
     assert report.stopped == (
-        "the log lacks cycles between 20 and 24 (5 records of loop/cycles were overwritten or damaged "
-        "before the recorder read them); the state of the controllers is unknown from cycle 25 on, so "
+        "the log lacks cycles between 20 and 24 (5 records of loop/cycles lost: overwritten or damaged "
+        "before reading); the state of the controllers is unknown from cycle 25 on, so "
         "the comparison ends"
     )
 
