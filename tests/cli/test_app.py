@@ -117,7 +117,7 @@ def test_a_value_may_hold_the_sign(torso):
         (
             FileNotFoundError(2, "No such file or directory", "x"),
             1,
-            "dxlrun: x: No such file or directory; --debug",
+            "dxlrun: x: No such file or directory; run with --debug for details",
         ),
         (ZeroDivisionError("oops"), 1, "dxlrun: internal error: ZeroDivisionError: oops"),
     ],

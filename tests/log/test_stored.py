@@ -75,7 +75,9 @@ def test_a_run_deletes_only_what_its_robot_file_says(logs: Path, monkeypatch: py
     assert len(stored.stored_logs(logs)) == 4
     monkeypatch.setattr(stored, "MUCH_BYTES", 300)
     (line,) = _disk_lines(last, RecordingPlan())
-    assert line.startswith(f"the logs in {logs} have 400 bytes; `dxlrun logs {logs} --prune --keep ")
+    assert line.startswith(
+        f"the logs in {logs} have 400 bytes; delete the oldest by `dxlrun logs {logs} --prune --keep "
+    )
     assert len(stored.stored_logs(logs)) == 4
     lines = _disk_lines(last, RecordingPlan(keep_bytes=250))
     assert [line.split()[1] for line in lines] == [
@@ -123,7 +125,7 @@ def test_pruning_shows_asks_and_deletes_only_after_a_yes(
         (["--keep", "1GB"], "write --prune and --keep together"),
         (["--prune", "--keep", "1GB", "--sort", "log"], "write --prune and --keep together"),
         (["--prune", "--keep", "5"], "--keep 5: '5' has no unit; write a size"),
-        (["--prune", "--keep", "5 s"], "which is not one of a size"),
+        (["--prune", "--keep", "5 s"], "has the wrong unit s for a size"),
     ],
 )
 def test_pruning_with_wrong_words_deletes_nothing(
