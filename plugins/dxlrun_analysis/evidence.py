@@ -208,5 +208,5 @@ def wake_up_remedy(real_time: RealTime) -> str:
     if not real_time.granted:
         return "The requested real-time scheduler was not granted: run `dxlrun doctor`."
     if not real_time.kernel:
-        return "The real-time scheduler was granted: install a real-time kernel."
+        return "The scheduler is real-time, but the kernel is not: install a real-time kernel."
     return "Scheduler and kernel are real-time: check the machine with `dxlrun doctor`."

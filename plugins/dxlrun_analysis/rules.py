@@ -57,15 +57,14 @@ RULES: Mapping[str, Rule] = {
     "another_host": Rule(
         "bus",
         "instructions from another sender, unrequested replies, or echoes of its own instructions",
-        "three instructions (noise has the right checksum once in 256 times), one write of servo items, or "
-        "ten replies",
+        "three instructions, one write of servo items, or ten replies; noise passes one checksum in 256",
         "Stop the other program (`fuser {port}` shows it), or unplug the other adapter; for "
         "echoes, check the direction control of the adapter.",
         Needs.LOG,
     ),
     "late_replies": Rule(
         "bus, or the machine if several buses are late at once",
-        "delay of replies beyond the times of wire, return delay and adapter",
+        "delay of replies in addition to wire time, return delay and adapter delay",
         "2 ms, in a tenth of the exchanges or in five replies after the timeout; 12 to 18 ms indicate a "
         "latency timer of 16 ms",
         "Check adapter, driver and USB hub.",
@@ -90,8 +89,8 @@ RULES: Mapping[str, Rule] = {
         "servo, or the bus that lost all of its servos at once",
         "lost by the loop: three missing replies in a row, and none for 50 ms",
         "once; for several servos together: within 0.5 s",
-        "Check its cable, plugs and supply, also at the angle of the loss; `dxlrun scan {port}` lists the "
-        "servos with an answer.",
+        "Check its cable, plugs and supply, also at the joint angle of the loss; `dxlrun scan {port}` "
+        "lists the servos with an answer.",
     ),
     "servo_rebooted": Rule(
         "servo",
@@ -159,7 +158,7 @@ RULES: Mapping[str, Rule] = {
     ),
     "oscillates": Rule(
         "joint, or the controller if its goals swing",
-        "swings around its trajectory, less the swings of the trajectory",
+        "swings around its trajectory, minus the swings of the trajectory",
         "2 deg, six times a second for a second; or ten even swings of 0.6 deg in a row",
         "Lower the gains of servo and controller; look for play in gears and horn.",
         _JOINT,
@@ -167,8 +166,8 @@ RULES: Mapping[str, Rule] = {
     "follows_worse": Rule(
         "joint",
         "error, lag and load compared with earlier values, at the same places and in the same direction",
-        "an error of 9 deg for a second; three times its earlier error, and 4.6 deg; or a change by 2 deg or "
-        "an eighth of its torque, three times that of any other joint",
+        "9 deg of error for a second; or 4.6 deg and three times the earlier error; or a change by 2 deg or "
+        "an eighth of the torque, three times the change of any other joint",
         "Turn it by hand without torque, and compare gains and limits with the robot file "
         "(`dxlrun servo {port} {servo_id} get`).",
         _JOINT,
@@ -176,18 +175,22 @@ RULES: Mapping[str, Rule] = {
     # Loop
     "busy_machine": Rule(
         "machine",
-        "seconds without an idle core, with a core withheld by the host, or with the loop waiting for a "
-        "core; a silent sampler",
+        "seconds without an idle core, with a core taken by the host of a virtual machine, with the loop "
+        "waiting for a core, or without a sample of the machine",
         "three seconds and a tenth of the run",
     ),
     "own_work": Rule(
         "loop, or the slow controller or bus",
         "time of long cycles beyond their planned exchanges",
-        "half of that time, in three cycles; a single stall of a machine is not enough",
+        "half of the excess of all long cycles, in three cycles; one stall of the machine is not enough",
         "Make it faster, give it a lower rate (`{{rate: ...}}`), or lower the rate of the loop.",
         Needs.MACHINE,
     ),
-    "skipped": Rule("loop", "skipped periods", "more than `tolerated_skips` of the periods of two seconds"),
+    "skipped": Rule(
+        "loop",
+        "skipped periods",
+        "more than `tolerated_skips` of all periods; shorter runs count as 2 s",
+    ),
     # Sensors and devices
     "silent": Rule(
         "device or sensor",

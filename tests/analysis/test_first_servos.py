@@ -55,7 +55,7 @@ def found(write: Make, wire: Make) -> Callable[..., dict[str, Finding]]:
 def test_chains_that_are_silent_while_single_servos_answer_are_the_first_servos(found: Make) -> None:
     findings = found(silent=lambda cycle: cycle % 8 == 7)
     assert findings["lossy_servo"].subject == "j1"
-    assert "and 50 whole chains as first servo" in findings["lossy_servo"].sentence
+    assert "and all replies of 50 chains that it starts" in findings["lossy_servo"].sentence
 
 
 def test_where_single_servos_do_not_answer_either_it_is_the_line(found: Make) -> None:

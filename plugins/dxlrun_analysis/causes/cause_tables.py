@@ -36,7 +36,9 @@ def causes_table(causes: Causes) -> Table:
         for one in causes.causes[:_MOST_CAUSES]
     ]
     late, long = (counted(number, "cycle", "cycles") for number in (causes.late, causes.long))
-    title = f"Causes: {late} woke late, {long} took too long; excess {microseconds(causes.excess_ns / 1e3)}"
+    title = (
+        f"Causes: {late} woke late, {long} took too long; total excess {microseconds(causes.excess_ns / 1e3)}"
+    )
     title += f" in the {KEPT} worst cycles" if max(causes.late, causes.long) > KEPT else ""
     return Table.from_rows(title, columns, rows)
 

@@ -14,7 +14,7 @@ from dxlrun import Log
 from dxlrun.tooling.records import LoadMeter, LoadSample, MachineLoad, load_sample
 from dxlrun.tooling.topics import LogTopic
 
-STEAL = "steal by the host"
+STEAL = "host of the virtual machine"
 OTHERS = "other processes on its core"
 INTERRUPTS = "interrupts on its core"
 TAKERS = (STEAL, OTHERS, INTERRUPTS)

@@ -122,7 +122,10 @@ def upload(directory: Path, store: str, /, *, as_json: JsonFlag = False, debug: 
     folder = season_runs.find_logs(directory)
     with progress_bar(hidden=as_json) as draw:
         result = stores.upload(folder, store, draw)
-    others = [f"{store} has a different run named {name}; use one prefix per robot" for name in result.others]
+    others = [
+        f"{store} has a different run named {name}; use a URL per robot, such as s3://lab/torso"
+        for name in result.others
+    ]
     written = [f"{name} was skipped: a run is writing it" for name in result.written]
     if as_json:
         show_json(result._asdict(), code=1 if others else 0, errors=others, warnings=written)

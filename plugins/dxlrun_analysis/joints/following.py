@@ -399,5 +399,5 @@ def _swings(mine: _FollowingEvidence, others: Sequence[_FollowingEvidence]) -> F
     if len(at_s) < max(_SWINGS, _OTHERS * theirs):
         return None
     hertz = (len(at_s) - 1) / float(at_s[-1] - at_s[0]) / 2
-    text = f"oscillates around its goal, {hertz:.0f} times a second, {len(at_s) // 2} times in a row"
+    text = f"oscillates around its goal {hertz:.0f} times a second, {len(at_s) // 2} oscillations in a row"
     return replace(joint_finding("oscillates", joint, text, float(at_s[0]), brief=True), rank=Rank.REMARK)

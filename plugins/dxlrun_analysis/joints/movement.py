@@ -70,7 +70,7 @@ class _Jumps:
         """Return the finding that the joint's position jumped; `begin_ns` is the start of the run."""
         jumps = "a position jump" if self.count == 1 else f"{self.count} position jumps"
         most, since_s = distance(joint, self.longest), (self.first_ns - begin_ns) * 1e-9
-        text = f"reported {jumps} of up to {most}, faster than its model turns"
+        text = f"reported {jumps} of up to {most}, faster than its servo model can turn"
         return joint_finding("position_jumped", joint, text, since_s, brief=True)
 
 

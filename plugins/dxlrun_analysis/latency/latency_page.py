@@ -37,10 +37,7 @@ def page(result: Result, blocks: Sequence[Block], machine: str) -> str:
         section("statistics", "Statistics", [table_element(table) for table in tables]),
         section("wake-ups", "Each wake-up", [*_about(result), *_plots(canvas, result, blocks)]),
     ]
-    made = (
-        "Made by dxlrun latency. The numbers of this page are in it as JSON, in the element with the "
-        "identifier report."
-    )
+    made = "Made by dxlrun latency. The element with id='report' contains the numbers of this page as JSON."
     return document("Wake-up latency", top, sections, footer(made), result, canvas.scripts())
 
 

@@ -14,7 +14,7 @@ error, effort."""
 _ALL = (
     ("temperature", "Temperature of the servos", "temperature, deg C", "deg C", 4.0),
     ("voltage", "Voltage at the servos", "voltage, V", "V", 1.0),
-    ("effort", "Load of the servos", "effort, Nm or share", "", 0.1),
+    ("effort", "Load of the servos", "effort, A, Nm or share of maximum", "", 0.1),
 )
 
 
@@ -38,7 +38,7 @@ def joint_plots(canvas: Canvas, cycles: Curves, row: int, joint: JointTracking) 
     for quantity, label, lines, least, times in (
         ("error", unit, error, _LEAST_ERROR, scale),
         ("velocity", f"{unit}/s", speed, _LEAST_SPEED, scale),
-        ("effort", f"{joint.unit.torque} or share", effort, _LEAST_EFFORT, 1.0),
+        ("effort", f"A, {joint.unit.torque} or share of maximum", effort, _LEAST_EFFORT, 1.0),
     ):
         # The measured loads of all joints have a common plot.
         if any(line.curve in cycles for line in (lines[1:] if quantity == "effort" else lines)):

@@ -51,8 +51,8 @@ def steps_plot(canvas: Canvas, cycles: Curves) -> Plot:
     plot.durations("y")
     over = int(np.count_nonzero(cycles.high("cycle") > cycles.low("period")))
     plot.text = (
-        "Read, update and write follow the wake-up; the cycle is their sum. A band spans the shortest and "
-        "longest of the cycles at one point. "
+        "Read, update and write follow the wake-up; the cycle is their sum. A point of a curve can combine "
+        "several cycles; the band spans their shortest and longest times. "
         + (
             "Some cycles took longer than their period."
             if over

@@ -256,6 +256,6 @@ def _each_event(run: _PageContent, number: int) -> list[Element]:
 def _footer(log: Log) -> Element:
     version = log.metadata.get("versions", {}).get("dxlrun", "of an unknown version")
     return footer(
-        f"Made by dxlrun analyze from {log.path.name}, which dxlrun {version} recorded. The numbers of this "
-        "page are in it as JSON, in the element with the identifier report."
+        f"Made by dxlrun analyze from {log.path.name}, recorded by dxlrun {version}. The element "
+        "with id='report' contains the numbers of this page as JSON."
     )

@@ -112,7 +112,7 @@ def _cumulative(canvas: Canvas, series: Sequence[WakeUps]) -> Plot:
         "point is the largest delay. The dashed line is at 150 us."
     )
     if latest == LATE_BINS_US:
-        plot.text += f" Latencies above {LATE_BINS_US // 1000} ms are drawn there."
+        plot.text += f" Latencies above {LATE_BINS_US // 1000} ms are drawn at this value."
     return plot
 
 

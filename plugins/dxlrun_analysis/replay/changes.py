@@ -114,8 +114,8 @@ def with_arguments(plan: RecordedPlan, loop: LoopPlan, arguments: Mapping[str, s
     same = _compiled(plan, plan.arguments)
     if (same.joints, same.controllers) != (plan.loop.joints, plan.loop.controllers):
         raise InputError(
-            "the robot file in the log no longer compiles to the plan of the run (other versions, or servo "
-            "models known only at start-up); use --set in place of arguments"
+            "the logged robot file now compiles to a different plan: versions differ, or servo models were "
+            "detected at start-up; use --set instead of arguments"
         )
     other = _compiled(plan, {**plan.arguments, **arguments})
     if other.period_ns != loop.period_ns:

@@ -131,7 +131,7 @@ class Comparison:
         states = [("active" if mask >> bit & 1 else "not active") for mask in (recorded, active)]
         plans = self._controllers()
         # A controller that the replay could not load has no name here.
-        name = plans[bit].name if bit < len(plans) else f"number {bit} of the run"
+        name = plans[bit].name if bit < len(plans) else f"number {bit} (name unknown)"
         return self._inputs.difference(index, "active", None, name, *states)
 
     def _named(self, field: str, place: int, active: int) -> tuple[str, str | None, str | None]:

@@ -168,7 +168,7 @@ def _prepared(
 
 def _where(kind: str, recorded: bytes, replayed: bytes | str) -> tuple[str, str, str]:
     """Return the place of the first element that differs, and its recorded and replayed value, as text."""
-    what = f"array that prepare made of {kind}"
+    what = f"prepared array of command {kind}"
     then = np.frombuffer(recorded[: len(recorded) // 8 * 8], "<u8")
     if isinstance(replayed, str):
         return what, counted(len(then), "number", "numbers"), replayed

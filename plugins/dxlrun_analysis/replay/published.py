@@ -143,7 +143,7 @@ def _where(
         if here[place] != value:
             return place, value, here[place]
     more = next((place for place in here if place not in then), "")
-    return more, "nothing", here.get(more, "the same fields in other bytes")
+    return more, "nothing", here.get(more, "equal fields, encoded differently")
 
 
 def _leaves(value: object, place: str) -> dict[str, str]:

@@ -339,5 +339,5 @@ def _policies(log: Log, policies: PolicyPlan) -> PolicyPlan:
     try:
         policy = policies.named(msgspec.json.decode(begun.data, type=_PolicyStart).policy)
     except (*UNREADABLE, KeyError) as error:
-        raise LogError(f"{log.path}: the policy that began cannot be read: {error}") from error
+        raise LogError(f"{log.path}: the policy at the end of the run cannot be read: {error}") from error
     return replace(policies, on_exit=policy)

@@ -320,7 +320,8 @@ class Occasions:
         name, named = bus.called(servo)
         mine = losses.get(servo, ServoLosses(0, 0))
         where = self._where(base + servo)
-        silent = f", and {mine.broken_off} whole chains as first servo" if mine.broken_off else ""
+        chains = counted(mine.broken_off, "chain", "chains")
+        silent = f" and all replies of {chains} that it starts" if mine.broken_off else ""
         sentence = f"{named} lost {mine.lost} of {mine.asked} replies{silent}, in "
         sentence += f"{counted(times, 'episode', 'episodes')}{where}; "
         sentence += "other servos of its bus answered at these times."

@@ -73,13 +73,13 @@ def test_machine_that_made_most_of_the_long_cycles_is_named(cycles: int, named: 
         one.sentence for one in judge_run(totals(causes=causes)).findings if one.code == "busy_machine"
     ]
     assert len(machine) == named
-    assert all("steal by the host took 70.00 ms of 100.00 ms" in one for one in machine)
+    assert all("host of the virtual machine took 70.00 ms of 100.00 ms" in one for one in machine)
     assert all("heat throttled the processor for 4 seconds" in one for one in machine)
 
 
 def test_the_table_has_the_causes_and_their_shares() -> None:
     table = causes_table(Causes(5, 10, 100_000_000, (cause("controller", "left_arm"), OTHER)))
-    assert table.title == "Causes: 5 cycles woke late, 10 cycles took too long; excess 100.00 ms"
+    assert table.title == "Causes: 5 cycles woke late, 10 cycles took too long; total excess 100.00 ms"
     assert [cell.text for cell in table.rows[0]] == [
         "controller",
         "left_arm",
@@ -97,4 +97,8 @@ def test_a_cause_in_a_sentence_has_its_subject_and_what_the_machine_did_is_the_c
         CauseShare("controller", "arm", 4.0),
         CauseShare("own work", "", 1.0),
     )
-    assert [share.label for share in shares] == ["steal by the host", "controller of arm", "own work"]
+    assert [share.label for share in shares] == [
+        "host of the virtual machine",
+        "controller of arm",
+        "own work",
+    ]

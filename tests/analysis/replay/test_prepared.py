@@ -79,7 +79,7 @@ def test_a_doubled_array_of_the_plan_is_named(pair_log: Path, monkeypatch: pytes
     assert (report.prepared, report.different_prepared) == (1, 1)
     assert (first.cycle, first.controller) == (10, "head")
     assert first.time_s == pytest.approx(0.2)
-    assert first.what.startswith("array that prepare made of trajectory, element ")
+    assert first.what.startswith("prepared array of command trajectory, element ")
     assert float(first.replayed) == 2 * float(first.recorded)
 
 
