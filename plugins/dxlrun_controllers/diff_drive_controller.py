@@ -326,7 +326,7 @@ class DiffDriveController(Controller[DiffDriveParameters]):
             moved = linear * elapsed_ns * 1e-9, angular * elapsed_ns * 1e-9
             self._pose.move_along_arc(*(self._rims(self._angles.turned) if by_position else moved))
         elif age_ns >= 0:
-            self.context.say(f"odometry lacks the distance of {age_ns * 1e-9:.2f} s without replies")
+            self.context.say(f"wheels did not reply for {age_ns * 1e-9:.2f} s; odometry omits this distance")
         self._holding = False
 
     def _hold(self, time_ns: int) -> None:

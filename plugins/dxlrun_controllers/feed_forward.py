@@ -63,7 +63,8 @@ class FeedForwardParameters(JointsParameters):
         if self.pass_on and self.command_interface == "position":
             yield (
                 ("pass_on",),
-                "pass_on does not fit command_interface position; remove pass_on, or command effort or pwm",
+                "pass_on does not fit command_interface position; remove pass_on, or set command_interface "
+                "to effort or pwm",
             )
 
 

@@ -60,7 +60,7 @@ class PidParameters(JointsParameters):
         yield from super().mistakes()
         if self.reference == "velocity" and self.command_interface == "position":
             what = "reference velocity does not fit command_interface position"
-            yield ("command_interface",), f"{what}; command effort, velocity or pwm"
+            yield ("command_interface",), f"{what}; write effort, velocity or pwm"
         if self.reference == "velocity" and self.wrap:
             yield ("wrap",), "velocities do not wrap; remove wrap, or use reference position"
 

@@ -264,7 +264,7 @@ def _of_figures(
     interface = parameters.command_interface
     if interface == "position" and _reach(parameters, joint, motor) is None:
         yield Mismatch(
-            f"needs the error for the full torque of {joint}",
+            f"needs the position error of {joint} at full torque",
             "write reach: 15 deg, name a motor file with a position_gain, or command poseffort",
             joint,
         )

@@ -133,7 +133,7 @@ WRONG_KEYS: Mapping[str, tuple[Keys, list[tuple[Keys, str]]]] = {
     "battery_state_broadcaster": (BATTERY, [
         ({"stop": "10.8 V"}, "stop is not below warn"),
         ({"voltages": []}, "at least 1 item"),
-        ({"voltages": ["power"]}, "power is not a state; write OWNER/voltage"),
+        ({"voltages": ["power"]}, "power is not a state; write OWNER/STATE, such as power/voltage"),
         ({"warn": 10.8}, "warn"),
     ]),
     "diff_drive_controller": (BASE, [

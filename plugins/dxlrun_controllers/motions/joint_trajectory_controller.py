@@ -403,9 +403,9 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         joint, limit = self.context.joints[row], self._speed_limit[row]
         needed_s = math.ceil(1e3 * time_s * speeds[row] / limit - 1e-6) * 1e-3
         text = (
-            f"joint {joint} needs {speeds[row]:.4g} a second to the first point, {way[row]:.4g} away in "
-            f"{time_s:.4g} s, more than its limit of {limit:.4g}; give the point "
-            f"{needed_s:.4g} s or more, as its time or by start_in"
+            f"joint {joint} needs {speeds[row]:.4g} a second to the first point ({way[row]:.4g} in "
+            f"{time_s:.4g} s), above its limit of {limit:.4g}; set the point's time or start_in to "
+            f"{needed_s:.4g} s or more"
         )
         goal, self._goal = self._goal, None
         if goal is not None:

@@ -54,10 +54,10 @@ class BatteryParameters(ParametersModel):
         if self.stop >= self.warn:
             yield ("stop",), "stop is not below warn; lower stop, or raise warn"
         if self.current is not None and "/" not in self.current:
-            yield ("current",), f"{self.current} is not a state; write OWNER/current"
+            yield ("current",), f"{self.current} is not a state; write OWNER/STATE, such as power/current"
         for index, name in enumerate(self.voltages):
             if "/" not in name:
-                yield ("voltages", index), f"{name} is not a state; write OWNER/voltage"
+                yield ("voltages", index), f"{name} is not a state; write OWNER/STATE, such as power/voltage"
 
 
 class BatteryStateBroadcaster(Controller[BatteryParameters]):

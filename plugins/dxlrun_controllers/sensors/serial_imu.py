@@ -51,7 +51,7 @@ class SerialImuParameters(ParametersModel):
     columns: tuple[str, ...] = Field(
         default=_SIX,
         min_length=1,
-        description="State of each number of a line, in the order of the line; `-` for an unused number.",
+        description="State names for the numbers of a line, in order; `-` skips a number.",
         examples=["[angular_velocity.x, '-', linear_acceleration.z]"],
     )
     scale: dict[str, Annotated[float, Field(ge=-1e9, le=1e9)]] = Field(

@@ -381,7 +381,7 @@ def test_a_splice_where_nothing_is_played_begins_at_once_and_one_that_is_too_fas
     np.testing.assert_allclose(seen(robot, (2.4, 2.5, 3.0))[:, 0], [0.9, 0.8, 0.8 - 1 / 2 / DECELERATION])
     outcome, told, *_ = robot.goal.ended[0]
     assert outcome is Outcome.ABORTED
-    assert told.startswith("joint a needs 9.819 a second to the first point, 0.5 away in 0.1 s")
+    assert told.startswith("joint a needs 9.819 a second to the first point (0.5 in 0.1 s)")
 
 
 def test_a_splice_after_the_end_of_the_one_before_is_waited_for_and_played():
@@ -643,8 +643,8 @@ def test_a_way_to_the_first_point_that_is_too_fast_for_the_joint_is_refused(time
     robot = started(TWO, limits={"velocity": 2.0})
     robot.send(0.0, "trajectory", points=one(0.3, 1.0, time=time))
     told = (
-        f"joint b needs {needed} a second to the first point, 1.2 away in {time or 0.02} s, more than its "
-        "limit of 2; give the point 0.6 s or more, as its time or by start_in"
+        f"joint b needs {needed} a second to the first point (1.2 in {time or 0.02} s), above its limit of "
+        "2; set the point's time or start_in to 0.6 s or more"
     )
     assert robot.goal.ended == [(Outcome.ABORTED, told, "b", pytest.approx(1.2))]
     np.testing.assert_array_equal(robot.update(0.02), [0.3, -0.2])
@@ -659,8 +659,8 @@ def test_the_way_to_the_first_point_is_judged_by_its_peak():
     robot = started(ONE, limits={"velocity": 2.0})
     there = [{"time": 0.5, "positions": [1.1], "velocities": [0.0]}]
     robot.send(0.0, "trajectory", points=there)
-    told = "joint a needs 2.4 a second to the first point, 0.8 away in 0.5 s, more than its limit of 2"
-    assert robot.goal.ended[0][1].startswith(f"{told}; give the point 0.6 s or more")
+    told = "joint a needs 2.4 a second to the first point (0.8 in 0.5 s), above its limit of 2"
+    assert robot.goal.ended[0][1].startswith(f"{told}; set the point's time or start_in to 0.6 s or more")
     robot.send(0.1, "trajectory", points=[there[0] | {"time": 0.6}])
     assert robot.goal.outcome is None
 

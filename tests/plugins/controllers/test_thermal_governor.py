@@ -151,7 +151,7 @@ def test_what_fits_is_accepted(tmp_path: Path, change: tuple[str, str]) -> None:
 @pytest.mark.parametrize(
     ("change", "at", "what"),
     [
-        ((f", {PARTS}", ""), "j]", "needs the error for the full torque of j; write reach"),
+        ((f", {PARTS}", ""), "j]", "needs the position error of j at full torque; write reach"),
         ((PARTS, f"{PARTS}, limit: 80"), "80", "has 80 deg C as limit of j, but the XM430-W350 cuts"),
         (("direction: 1", "direction: 1, registers: {temperature_limit: 60}"), "", ""),
         ((PARTS, f"{PARTS}, limit: {{j: 95}}"), "{j: 95}", "beyond 80; write limit: 75 or less"),

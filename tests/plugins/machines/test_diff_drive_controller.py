@@ -285,7 +285,7 @@ def test_a_lost_reply_is_made_up_for_and_a_lost_servo_is_reported():
     robot.states.valid[0] = True
     robot.states.position[0] -= 12.0  # it has rebooted and counts from another turn
     robot.step()
-    assert robot.said[1] == "odometry lacks the distance of 0.42 s without replies"
+    assert robot.said[1] == "wheels did not reply for 0.42 s; odometry omits this distance"
     robot.states.position[:] += 0.1
     robot.step()
     assert robot.controller._pose.x == pytest.approx(0.4 * RADIUS)
