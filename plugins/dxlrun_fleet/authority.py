@@ -98,7 +98,7 @@ def issue(name: str, role: Role | None, days: int, to: Path) -> IssuedCertificat
     held = there.exists() and _is_named(there, name)
     if not held and (there.exists() or (kept.exists() and to == keys_place())):
         raise InputError(
-            f"{there} is not the certificate of {name}; give --output DIRECTORY for another computer's files"
+            f"{there} is not the certificate of {name}; write it elsewhere with --output DIRECTORY"
         )
     if (to / "ca.crt").exists() and (to / "ca.crt").read_bytes() != root:
         raise InputError(f"{to / 'ca.crt'} belongs to another authority; give another directory")

@@ -130,7 +130,7 @@ def _refuse_unused(action: str, given: Mapping[str, object]) -> None:
     for option, value in given.items():
         if value is not None and action not in _ACTIONS_WITH[option]:
             actions = " and ".join(_ACTIONS_WITH[option])
-            raise InputError(f"`dxlrun keys {action}` does not accept {option}, only {actions}; omit it")
+            raise InputError(f"{option} is not for `dxlrun keys {action}`, only for {actions}; remove it")
 
 
 def _state(one: IssuedCertificates, refused: frozenset[str]) -> str:

@@ -42,7 +42,7 @@ def page(found: CharacterizationResult) -> str:
         for joint in found.joints
     ]
     made = (
-        "Made by dxlrun characterize. The element with the ID report contains the numbers of this page as "
+        "Made by dxlrun characterize. The element with id='report' contains the numbers of this page as "
         "JSON, in SI units."
     )
     return document(f"{_TITLE}: {found.robot}", top, sections, footer(made), results(found))

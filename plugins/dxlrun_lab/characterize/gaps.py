@@ -140,7 +140,7 @@ def longest_gap(
     """
     name = f"longest gap, {interface}"
     degrees = f"{math.degrees(tolerance):.2g} deg"
-    how = f"motion of the thesis at up to {speed:.2g} rad/s, {len(tried)} gaps; tolerance {degrees}"
+    how = f"sum of two sines at up to {speed:.2g} rad/s, {len(tried)} gaps; tolerance {degrees}"
     if not tried:
         return not_measured(name, "s", "no gap was tried", how)
     bad = [gap for gap in tried if not gap.kept(tolerance)]

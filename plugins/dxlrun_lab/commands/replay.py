@@ -79,7 +79,7 @@ def replay(
     warnings = [f"{report.robot}: {remark}" for remark in (*report.remarks, report.stopped) if remark]
     if report.unprepared:
         them = counted(report.unprepared, "command", "commands")
-        warnings.append(f"{report.robot}: {them} not prepared again, because the log lacks the requests")
+        warnings.append(f"{report.robot}: {them} replayed as recorded: the log lacks the original requests")
     exit_code = 0 if report.same else 1
     if as_json:
         content = msgspec.to_builtins(report) | {"same": report.same, "sentence": report.sentence}

@@ -25,7 +25,7 @@ from dxlrun.tooling.verbs import (
 if TYPE_CHECKING:
     from dxlrun_lab.tracking.tracking_experiment import TrackingExperiment
 
-experiment = App(name="experiment", help="Repeat an experiment of the thesis on this machine.")
+experiment = App(name="experiment", help="Repeat a published experiment on this machine.")
 
 _ACTIVE = ("position_trajectory:=false", "posvel_trajectory:=true")
 """Arguments of single_joint.yaml for the thesis' motion as positions and velocities"""
@@ -55,7 +55,7 @@ def tracking(
     robot
         Robot file. Default: single_joint.yaml of `dxlrun examples`.
     play
-        Motion file to play, of one joint. Default: the motion of the thesis for single_joint.yaml, 30 s.
+        Motion file to play, of one joint. Default: the tracking motion of single_joint.yaml, 30 s.
     setups
         Set-ups to measure, separated by commas.
     stress

@@ -251,7 +251,7 @@ class _Stage:
             )
             if outcome != "reached":
                 # A goal that the runtime ended has no text, but the state of its joint may have the reason.
-                text = self._find_abort_reason() or text or f"the goal of the samples was {outcome}"
+                text = self._find_abort_reason() or text or f"playback of the segment was {outcome}"
         except RunGone as gone:
             text = str(gone)
         cycles = self.rig.recorded(goal)
@@ -282,7 +282,7 @@ class _Stage:
         goal = self._send(segment)
         outcome, text = self.rig.wait_for_goal(goal, self._find_abort_reason, segment.duration_s + _EXTRA_S)
         if outcome != "reached":
-            raise _EarlyEnd(text or f"the goal of the approach was {outcome}")
+            raise _EarlyEnd(text or f"the approach motion was {outcome}")
 
     def _send(self, segment: Segment) -> int:
         """Send a segment's table to the active sample_player, in pieces that fit into a cycle. Returns the

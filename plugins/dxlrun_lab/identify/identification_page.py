@@ -40,7 +40,7 @@ def page(robot: str, results: Sequence[JointResult]) -> str:
         ],
     )
     sections = [_section(number, each, result) for number, (each, result) in enumerate(found)]
-    end = footer("The element with the ID report contains the numbers of this page as JSON.")
+    end = footer("The element with id='report' contains the numbers of this page as JSON.")
     return document(f"{robot}: identified servos", top, sections, end, [result for _, result in found])
 
 

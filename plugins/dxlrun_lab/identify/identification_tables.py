@@ -27,8 +27,9 @@ def parts(result: IdentifiedServo) -> tuple[Part, ...]:
         f"{'* ' if result.scale == 'manual' else ''}{result.scale_sentence}",
         f"friction model {result.friction_model} ({_MODELS[result.friction_model]}): chosen by BIC and "
         f"held-out error from {_candidates(result)}",
-        f"the model follows {result.seconds:.0f} s to {degrees[0]:.3f} deg RMS, and the held-out seconds to "
-        f"{degrees[1]:.3f} deg; intervals are linearised, with residuals correlated within a second",
+        f"error of the model: {degrees[0]:.3f} deg RMS in {result.seconds:.0f} s, {degrees[1]:.3f} deg in "
+        "the held-out seconds",
+        "intervals are linearised; residuals count as correlated within a second",
         *result.notes,
     ]
     return (values_table(result), *(Sentence(f"  {line}") for line in lines))

@@ -293,15 +293,16 @@ def _notes(  # noqa: PLR0917  all that a sentence may be about
     if "gain" not in fit.free:
         _, where = servo.expected_gain()
         notes.append(
-            f"position_gain is from {where}, because the duty never reached its limit and is not measured; "
-            "an error of this gain is also in torque constant and resistance"
+            f"position_gain is from {where}, not identified: the duty was not measured and never reached its "
+            "limit; an error of position_gain also changes torque constant and resistance"
         )
     if "viscous_friction" not in fit.free:
-        notes.append(
-            "without a measured current, viscous friction and back-EMF cannot be separated: torque constant, "
-            "resistance and their expected values contain both; the motor file's interval includes the usual "
-            f"share of viscous friction, {_viscous_share(servo):.1%}"
-        )
+        notes += [
+            "viscous friction and back-EMF cannot be separated without a measured current: torque constant, "
+            "resistance and their expected values include both",
+            "the interval of the torque constant in the motor file allows for a share of viscous friction of "
+            f"{_viscous_share(servo):.1%}",
+        ]
     if load.inertia is None:
         notes.append("the inertia includes motor and load; give --load-inertia to separate them")
     if scale == "load" and "resistance" in fit.free:

@@ -133,14 +133,14 @@ def page(experiment: TrackingExperiment) -> str:
             ("error", "desired minus read position, both at the time of reading"),
             (
                 "late",
-                "cycles with a start more than 150 us after the first deadline following the previous cycle",
+                "cycles started more than 150 us late, counted from the first skipped deadline if any",
             ),
             ("mean, largest late", "of the late cycles"),
             ("no reply", "cycles without an intact reply of the joint's servo"),
             (
                 "simulated bus",
-                "delay of cycles by simulated servos, from the ledger; of the other columns, only duration "
-                "includes it, as do the sentences above",
+                "total delay of the cycles by simulated servos; duration and the sentences above include it, "
+                "all other rows exclude it",
             ),
         ),
     )
