@@ -51,7 +51,7 @@ class SerialImuParameters(ParametersModel):
     columns: tuple[str, ...] = Field(
         default=_SIX,
         min_length=1,
-        description="State names for the numbers of a line, in order; `-` skips a number.",
+        description="State names for the numbers of a line, from left to right; `-` skips a number.",
         examples=["[angular_velocity.x, '-', linear_acceleration.z]"],
     )
     scale: dict[str, Annotated[float, Field(ge=-1e9, le=1e9)]] = Field(
