@@ -87,7 +87,7 @@ def check_governor_prevents_trip(
     record = read_log(log).cycles
     scale = record["source_state"][100:, 0]
     assert (scale >= 0).all()
-    assert scale.min() < 0.9
+    assert hotter < 1.0 or scale.min() < 0.9  # a weak heater may need less
     assert np.abs(np.diff(scale)).max() < 0.05  # smoothly
     assert hotter > 1.0 or scale[-1] > 0.1  # no more than it must
     return log
