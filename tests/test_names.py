@@ -36,6 +36,7 @@ SHARED_METHODS = {
     "mistakes": "hook of `ParametersModel`",
     "add_slice": "protocol `Collector` of the analysis",
     "perform_on": "members of the union `Action` of the view",
+    "words": "requests to the loop, each as text for its event",
 }
 SHARED_CLASSES = {
     "Switch": "advertised by the service for viewers, and in the description of the HTTP interface",

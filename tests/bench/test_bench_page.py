@@ -45,7 +45,7 @@ def test_the_search_for_a_rate_is_understood_as_the_page_has_it(capsys: pytest.C
     words = [str(ROOT / word) if word.startswith("robots/") else word for word in shlex.split(line)]
     # refused for this alone, so everything before it was understood
     assert main([*words, "--duration", "-1"]) == 2
-    assert capsys.readouterr().err.startswith("dxlrun: --duration -1: give from")
+    assert capsys.readouterr().err.startswith("dxlrun: --duration -1: give 0.1")
 
 
 @pytest.mark.parametrize("line", EXCHANGES)

@@ -48,7 +48,7 @@ def test_arm_of_ros2_control_is_checked_and_plays_its_motion(
     assert run == ["arm.yaml", "port:=/dev/ttyUSB0"]  # play is the same without a port
     refused = dxlrun("check", "controllers.yaml")
     assert refused.code == 2
-    assert "a parameter file of ROS 2, as ros2_control has it" in refused.err
+    assert "a parameter file of ROS 2 (ros2_control)" in refused.err
 
 
 def test_programs_of_the_sdk_and_rustypot_move_both_servos(simulated_line: Callable[..., Any]) -> None:

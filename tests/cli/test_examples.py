@@ -83,8 +83,7 @@ def test_what_was_changed_is_not_overwritten(dxlrun: Callable, tmp_path: Path):
 
     assert said.code == 2
     assert said.errors == [
-        f"dxlrun: {tmp_path}/bioloid_torso.yaml is there already, with other contents, and stays; "
-        "choose another directory"
+        f"dxlrun: {tmp_path}/bioloid_torso.yaml already exists with other contents; choose another directory"
     ]
     assert [path.name for path in tmp_path.iterdir()] == ["bioloid_torso.yaml"]
     assert (tmp_path / "bioloid_torso.yaml").read_text() == "name: mine\n"

@@ -229,7 +229,7 @@ def test_a_time_is_sent_for_joints_by_name(dxlrun: Dxlrun, robot: Robot) -> None
     assert dxlrun("send", "arm", "position", "elbow=20deg", "--in", "2").code == 0
     assert robot.requests[-1][-1] == 2.0
     said = dxlrun("send", "arm", "position", "elbow=20deg", "--in", "2m")
-    assert (said.code, said.err.startswith("dxlrun: --in: '2m' has the unit m")) == (2, True), said
+    assert (said.code, said.err.startswith("dxlrun: --in: '2m' has the wrong unit m")) == (2, True), said
 
 
 def test_cancel_takes_a_number_a_controller_or_all(dxlrun: Dxlrun, robot: Robot) -> None:
@@ -383,8 +383,8 @@ def test_motions_are_played_one_after_the_other_until_one_does_not_reach_its_end
         ((), "name a motion; `dxlrun play --list` shows those of the robot"),
         (("walk", "--list"), "--list takes no motions; omit walk"),
         (("walk", "--loop", "0"), "--loop 0 is not a number of repetitions; give 1 to 10000"),
-        (("walk", "bow", "--no-wait"), "--no-wait can start only one motion; omit it"),
-        (("walk", "--loop", "2", "--no-wait"), "--no-wait can start only one motion; omit it"),
+        (("walk", "bow", "--no-wait"), "--no-wait can start only one motion; omit --no-wait"),
+        (("walk", "--loop", "2", "--no-wait"), "--no-wait can start only one motion; omit --no-wait"),
         (("walk", "nowhere/wave.yaml"), "motion file nowhere/wave.yaml not found; check the path"),
         (("walk", "wolk"), "has no motion wolk, and no file has this name; did you mean walk?"),
     ],

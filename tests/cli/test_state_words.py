@@ -11,7 +11,9 @@ from pathlib import Path
 from dxlrun.channels.cycle import Torque
 
 ROOT = Path(__file__).parents[2]
-OTHER_WORDS = re.compile(r"\b(has|have|holds) no torque\b(?! limit)|\bjoints? without torque\b")
+OTHER_WORDS = re.compile(
+    r"\b(has|have|holds) no torque\b(?! (limit|or current mode))|\bjoints? without torque\b"
+)
 
 
 def _messages(file: Path) -> Iterator[str]:

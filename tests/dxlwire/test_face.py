@@ -91,4 +91,4 @@ def test_tests_of_dxlwire_need_neither_runtime_nor_simulation() -> None:
     own = {name for names in found.values() for name in names if name.split(".")[0] in ("dxlrun", "dxlsim")}
     assert own == set()
     kit = {name for names in found.values() for name in names if name.startswith("tests.")}
-    assert kit == {"tests.kit.plans"}
+    assert kit == {"tests.kit.awaited", "tests.kit.plans"}

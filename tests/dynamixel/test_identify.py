@@ -95,10 +95,10 @@ def test_a_robot_file_is_compiled_with_what_the_servo_says(simulated_line, tmp_p
     robot.write_text(ROBOT.replace("PORT", path))
     checked = compile_files(robot, {}, [])
     assert [servo.model for servo in checked.plan.buses[0].servos] == ["XM430-W350"] * 2
-    assert [problem.severity for problem in checked.warnings if "reports its model" in problem.what]
+    assert [problem.severity for problem in checked.warnings if "is unknown until the start" in problem.what]
     compiled = compile_files(robot, {}, [], None, read_models)
     assert [servo.model for servo in compiled.plan.buses[0].servos] == ["XL-320", "XM430-W350"]
-    assert [problem for problem in compiled.warnings if "reports its model" in problem.what] == []
+    assert [problem for problem in compiled.warnings if "is unknown until the start" in problem.what] == []
     assert compiled.plan.buses[0].servos[0].rad_per_tick == pytest.approx(math.radians(300) / 1023)
 
 

@@ -134,8 +134,10 @@ def test_check_of_the_feature_names_the_place(tmp_path: Path) -> None:
 
 def test_unit_of_the_other_kind_of_joint_is_refused(tmp_path: Path) -> None:
     slide = f"{ROBOT}  slide: {SLIDE % ', backlash: 1 deg'}\n"
-    assert "slide is linear, and its backlash is in rad; write it as 0.2 mm" in problems(tmp_path, slide)
-    assert "and its backlash is in m; write it as 0.5 deg" in problems(
+    assert "slide is linear, so its backlash cannot be in rad; write it as 0.2 mm" in problems(
+        tmp_path, slide
+    )
+    assert "so its backlash cannot be in m; write it as 0.5 deg" in problems(
         tmp_path, ROBOT.replace("4 deg", "4 mm")
     )
 

@@ -31,5 +31,5 @@ def test_the_network_is_served_with_tls_alone() -> None:
 
 @pytest.mark.needs("foxglove")
 def test_a_robot_has_to_run() -> None:
-    with pytest.raises(DxlrunError, match="no robot runs"):
+    with pytest.raises(DxlrunError, match="no running robot found"):
         foxglove()

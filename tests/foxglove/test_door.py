@@ -38,7 +38,7 @@ def test_only_the_token_of_this_start_opens_the_door(serve: Callable[..., Served
         viewer.take()  # no robot runs
     assert caught.value.rcvd is not None
     assert caught.value.rcvd.code == 1013
-    assert "no robot bioloid_torso_imu runs" in caught.value.rcvd.reason
+    assert "robot bioloid_torso_imu is not running" in caught.value.rcvd.reason
 
 
 @pytest.mark.parametrize(

@@ -126,7 +126,7 @@ def test_a_log_that_is_cut_at_any_byte_is_read_up_to_its_last_whole_chunk(
         assert len(found[1]) == 2 * whole * CYCLES
         assert not found[2].about.complete
         if whole == CHUNKS:
-            assert "no end" in found[2].damage[-1]
+            assert "ends early" in found[2].damage[-1]
 
 
 @campaign(ci=60, night=1000, release=10_000)

@@ -291,4 +291,4 @@ def test_keys_write_over_nothing_that_is_anothers(computers):
     assert {path: path.read_bytes() for path in kept} == kept
     computers.at("other")
     assert main(["keys", "robot", "arm", "--output", str(computers.place / "lab3/bert")]) == 2
-    assert "is of another authority" in computers.capsys.readouterr().err
+    assert "belongs to another authority" in computers.capsys.readouterr().err

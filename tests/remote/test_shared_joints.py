@@ -88,10 +88,10 @@ def test_experiments_on_single_servos_refuse_what_is_none(plan: Plan) -> None:
     with pytest.raises(InputError) as refused:
         require_own_servos(plan, ("head", "hip", "knee", "slide", "roll"), "identify", gears=False)
     assert [sentence.partition(";")[0] for sentence in refused.value.sentences] == [
-        "hip has 2 servos (ID 1 and 2 on bus main)",
-        "knee has a gear of 2.5 : 1",
-        "slide is linear",
-        "roll has 2 servos (ID 4 and 5 on bus main)",
+        "hip has 2 servos (ID 1 and 2 on bus main), but `dxlrun identify` measures one servo",
+        "knee has a gear of 2.5 : 1, but `dxlrun identify` measures one servo",
+        "slide is linear, but `dxlrun identify` measures one servo",
+        "roll has 2 servos (ID 4 and 5 on bus main), but `dxlrun identify` measures one servo",
     ]
 
 

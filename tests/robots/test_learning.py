@@ -90,7 +90,7 @@ def test_another_servo_begins_anew_and_is_learned(tmp_path):
         learned(kept, path, **QUICK)
     swapped = learned(kept, path, p_gain="16", **QUICK)
     first, second = said(swapped)
-    assert first == f"starts without its kept state: joint p_gain was 32 and is 16 ({kept}/arm.kept)"
+    assert first == f"starts without its kept state: joint p_gain was 32, now 16 ({kept}/arm.kept)"
     assert "is not learned yet: no correction" in second
     errors = [error_of(swapped), error_of(learned(kept, path, p_gain="16", **QUICK))]
     assert errors[1] < 0.7 * errors[0]

@@ -360,5 +360,5 @@ def test_a_time_in_the_future_is_reported(tmp_path, monkeypatch):
         assert sampled.sample()
     assert (reader.read_sample() or 1 << 62) <= time.monotonic_ns()
     assert re.fullmatch(
-        r"its times are [45]\d\d\d ms in the future; arrival times are used", reader.read_text()
+        r"its timestamps are [45]\d\d\d ms in the future; arrival times are used", reader.read_text()
     )

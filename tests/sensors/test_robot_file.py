@@ -73,7 +73,7 @@ def test_a_simulated_sensor_needs_a_urdf_and_simulated_servos(refusals):
     ]
     (sentence,) = refusals(("port: sim", "port: /dev/ttyUSB0"))
     assert sentence.startswith(
-        "crane.yaml:11:3: imu senses the simulated body, but bus main has a real port; choose a real"
+        "crane.yaml:11:3: imu senses the simulated body, but bus main has a real port; write a `type`"
     )
 
 

@@ -184,7 +184,7 @@ def test_pulled_and_plugged_in_again_it_goes_on(device, monkeypatch):
     assert reader.read_text() == ""  # not asked again yet
     ahead_ns += 600_000_000
     assert not sampled.sample()
-    assert f"there is no {device.name}" in reader.read_text()
+    assert f"port {device.name} not found" in reader.read_text()
     device.plug()
     ahead_ns += 1_100_000_000
     device.send(b"\n" + LINE)

@@ -391,7 +391,7 @@ def test_a_host_that_floods_the_line_feels_its_rate(start_buses):
 def test_a_link_never_replaces_a_file_and_is_removed_only_where_it_was_put(tmp_path):
     file, link = tmp_path / "file", tmp_path / "link"
     file.write_text("mine")
-    with pytest.raises(FileExistsError, match="is not a link"):
+    with pytest.raises(FileExistsError, match="is not a symbolic link"):
         DeviceLink(file).point("/dev/null")
     one, other = DeviceLink(link), DeviceLink(link)
     one.point("/dev/null")

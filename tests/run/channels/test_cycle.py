@@ -100,7 +100,7 @@ def test_the_mask_of_controllers_has_an_end():
     record.active = 1 << 62
     read = np.frombuffer(bytes(record.raw), dtype=record.layout.dtype)[0]
     assert int(read["active"]) == 1 << 62
-    with pytest.raises(ValueError, match="at most 63"):
+    with pytest.raises(ValueError, match="more than 63"):
         layout_of(1, 64)
 
 

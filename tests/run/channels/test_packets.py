@@ -97,7 +97,7 @@ def test_a_cut_batch_is_refused(cut):
 
 
 def test_a_desk_without_room_for_a_packet_is_refused():
-    with pytest.raises(ValueError, match="holds no packet"):
+    with pytest.raises(ValueError, match="cannot hold a packet"):
         PacketBatch(collected()[1], desk_of(40))
 
 

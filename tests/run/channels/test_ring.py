@@ -257,7 +257,7 @@ def test_the_newest_record_alone(make):
 def test_a_record_longer_than_the_longest_is_refused_and_leaves_the_ring_whole(make):
     descriptor = make(128, 10)
     writer, reader = RingWriter(descriptor), RingReader(descriptor)
-    with pytest.raises(ValueError, match="does not fit"):
+    with pytest.raises(ValueError, match="longer than the ring"):
         append(writer, bytes(11))
     assert reader.read_record() is None
     append(writer, bytes(10))
