@@ -102,9 +102,9 @@ def test_values_that_do_not_fit_their_field_are_refused() -> None:
         codec.pack(*good[:4], np.zeros(1, dtype=np.float32))
     with pytest.raises(ValueError, match="an array of float64 expected"):
         codec.pack(*good[:4], b"12345678")
-    with pytest.raises(ValueError, match="where text"):
+    with pytest.raises(ValueError, match="text expected"):
         codec.pack(((0, 0), 5), *good[1:])
-    with pytest.raises(ValueError, match="where a sequence"):
+    with pytest.raises(ValueError, match="a sequence expected"):
         codec.pack(good[0], "abc", *good[2:])
     with pytest.raises(ValueError, match="has the fields header, name"):
         codec.pack(*good[:2])

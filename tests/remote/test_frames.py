@@ -81,5 +81,5 @@ def test_the_body_turns_with_its_imu(desk):
 
 
 def test_a_robot_without_a_urdf_says_so(desk):
-    with pytest.raises(dxlrun.DxlrunError, match="pair has no URDF; write `model: {urdf"):
+    with pytest.raises(dxlrun.DxlrunError, match=r"pair has no URDF; write `model: {urdf"):
         RemoteRobot("pair", DeskLink(desk)).frames()
