@@ -42,6 +42,22 @@ def test_whole_suite_leaves_out_long_tests_and_reports_it_last(run, workers: str
     assert last == "left out: 1 long tests that no change can break (--all runs them)"
 
 
+def test_options_are_known_where_the_whole_suite_runs(tmp_path: Path) -> None:
+    """Without paths, pytest finds tests/conftest.py below the root, unless another word is a path."""
+    (tmp_path / "changed.txt").write_text("README.md\n")
+    options = (
+        f"--changed={tmp_path}/changed.txt",
+        "--strict-skips",
+        "--campaigns",
+        "-k",
+        "no_test_has_this_name",
+    )
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *options]
+    ran = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert "unrecognized" not in ran.stderr
+    assert "release  test" in ran.stdout
+
+
 @pytest.mark.parametrize("words", [("--all",), ("test_long.py", "test_short.py"), (".",)])
 def test_all_and_named_paths_run_as_a_whole(run, words: tuple[str, ...]) -> None:
     assert run("-n", "0", *words)[-1].startswith("2 passed")

@@ -57,7 +57,7 @@ RULES: Mapping[str, Rule] = {
     "another_host": Rule(
         "bus",
         "instructions from another sender, unrequested replies, or echoes of its own instructions",
-        "three instructions, one write of servo items, or ten replies; noise passes one checksum in 256",
+        "three instructions, one write of servo items, or ten replies; fewer can be noise",
         "Stop the other program (`fuser {port}` shows it), or unplug the other adapter; for "
         "echoes, check the direction control of the adapter.",
         Needs.LOG,
@@ -158,7 +158,7 @@ RULES: Mapping[str, Rule] = {
     ),
     "oscillates": Rule(
         "joint, or the controller if its goals swing",
-        "swings around its trajectory, minus the swings of the trajectory",
+        "swings around its trajectory that the trajectory does not have",
         "2 deg, six times a second for a second; or ten even swings of 0.6 deg in a row",
         "Lower the gains of servo and controller; look for play in gears and horn.",
         _JOINT,
@@ -182,7 +182,7 @@ RULES: Mapping[str, Rule] = {
     "own_work": Rule(
         "loop, or the slow controller or bus",
         "time of long cycles beyond their planned exchanges",
-        "half of the excess of all long cycles, in three cycles; one stall of the machine is not enough",
+        "half of the excess of all long cycles, in at least three cycles",
         "Make it faster, give it a lower rate (`{{rate: ...}}`), or lower the rate of the loop.",
         Needs.MACHINE,
     ),

@@ -48,6 +48,6 @@ def mode_of(names: Collection[str]) -> Mode:
     """
     mode = _MODES.get(frozenset(names))
     if mode is None:
-        combined = f"combines {' and '.join(names)}" if names else "has no interface"
+        combined = f"combines {' and '.join(names)}" if names else "is named"
         raise ValueError(f"no servo mode {combined}")
     return mode

@@ -112,7 +112,7 @@ def test_what_the_page_declares_is_declared():
 @pytest.mark.parametrize("limit", ["cw_angle_limit: 10", "ccw_angle_limit: 1000"])
 def test_angle_limits_of_protocol_1_choose_the_mode_and_those_of_an_xl320_do_not(limit):
     (problem,) = problems_in(AX.format(registers=f"{{{limit}}}", model="AX-12A"))
-    assert "by both angle limits" in problem.what
+    assert "both angle limits choose" in problem.what
     found, _ = declared(f"{{{limit}}}", ROBOT.replace("180 deg", "150 deg"), "XL-320")
     assert [f"{one.name}: {one.value}" for one in found] == [limit]
 

@@ -5,7 +5,7 @@ Whatever is named on the command line runs as a whole. Of the whole suite everyt
 tests that a change can break:
 
     git diff --name-only main > changed.txt
-    pytest --changed changed.txt    # and the long tests of rooms that changed, or import what changed
+    pytest --changed=changed.txt    # and the long tests of rooms that changed, or import what changed
     pytest --all                    # everything
 
 How a run ends, and what the network is refused, is never marked as long: tests of safety always run.

@@ -156,10 +156,10 @@ def _parts(whole: float, registers: Mapping[str, int], unit: float) -> str:
     """Describe which parts of a dead band (rad) the servo's margin and friction cause."""
     margins = [registers[name] * unit for name in MARGINS if name in registers]
     if not margins:
-        return "all by friction / position gain; the model has no compliance margin"
+        return "all from friction divided by position gain; the model has no compliance margin"
     margin = sum(margins) / len(margins)
     left = max(0.0, whole - margin)
     return (
         f"{math.degrees(margin):.2f} deg by the compliance margin, "
-        f"{math.degrees(left):.2f} deg by friction / position gain"
+        f"{math.degrees(left):.2f} deg from friction divided by position gain"
     )

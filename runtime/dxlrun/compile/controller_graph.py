@@ -317,7 +317,7 @@ class ControllerGraph:
                     f"{lower.name} (every {_cycles(lower.every)})"
                 )
                 rate = f" ({lower.rate:g} Hz)" if lower.rate is not None else ""
-                fix = f"write a rate that is that of {lower.name}{rate} divided by a whole number"
+                fix = f"choose the rate of {lower.name}{rate} divided by a whole number"
                 key = "rate" if plan.rate is not None else "into"
                 yield Mistake((*_path(plan.name), key), what, fix)
 

@@ -292,7 +292,7 @@ def not_numbers(size: int) -> str:
 
 
 def no_single_goal(controller: str) -> str:
-    return f"the motion's part for {controller} has several goals or a later one, so it has no single goal"
+    return f"the motion has other goals for {controller} than a single one at its start"
 
 
 def command_upper(upper: str) -> str:

@@ -175,7 +175,7 @@ def name_too_long(longest: int) -> str:
 
 
 def active_at_once(controller: str) -> str:
-    return f"{controller} cannot become active as it is loaded; load it first, then switch to it"
+    return f"controllers are loaded inactive; load {controller} first, then switch to it"
 
 
 def parameter_parts(parts: Sequence[str]) -> str:

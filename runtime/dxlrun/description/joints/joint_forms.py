@@ -147,7 +147,7 @@ class ServoJoint(BareJoint):
     model: str = key(
         "Model of the servo (see `dxlrun models`), or auto to read it from the servo.", "AX-12A", min_length=1
     )
-    reference: Angle = key("Angle of the servo, from its tick 0, where the joint is at zero.", "150 deg")
+    reference: Angle = key("Angle of the servo at the joint's zero position, counted from tick 0.", "150 deg")
     direction: Direction = key(
         "Sense of rotation: 1 if the joint's position grows with the servo's angle, else -1.", "1"
     )

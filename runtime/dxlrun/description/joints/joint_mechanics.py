@@ -155,7 +155,7 @@ class OneOfServos(ServoEntry):
     bus: str | None = key("Name of the servo's bus; the joint's by default.", "legs", None)
     model: str | None = key("Model of the servo; the joint's by default.", "MX-64", None, min_length=1)
     reference: Angle | None = key(
-        "Angle of the servo, from its tick 0, where the joint is at zero; the joint's reference by default.",
+        "Angle of the servo at the joint's zero position, from tick 0; the joint's reference by default.",
         "180 deg",
         None,
     )

@@ -32,7 +32,7 @@ class TransmissionServo(ServoEntry):
         min_length=1,
     )
     reference: Angle = key(
-        "Angle of the servo, from its tick 0, where the transmission's joints are at zero.",
+        "Angle of the servo at the zero position of the transmission's joints, counted from tick 0.",
         "180 deg",
     )
     direction: Direction = key(

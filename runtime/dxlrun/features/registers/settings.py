@@ -186,7 +186,7 @@ def own_reason(table: ControlTable, item: ControlItem) -> tuple[str, str] | None
         return "a reboot resets it", "remove it"
     if item.name in _ANGLE_LIMITS and table.protocol == 1.0:
         return (
-            "dxlrun chooses the mode by both angle limits",
+            "both angle limits choose the mode, which dxlrun sets",
             "write `limits: {position: ...}` instead",
         )
     rule = item.deviation
