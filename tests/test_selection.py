@@ -63,6 +63,15 @@ def test_all_and_named_paths_run_as_a_whole(run, words: tuple[str, ...]) -> None
     assert run("-n", "0", *words)[-1].startswith("2 passed")
 
 
+@pytest.mark.parametrize("workers", ["0", "2"])
+def test_changed_files_run_their_long_tests_in_every_process(run, tmp_path: Path, workers: str) -> None:
+    (tmp_path / "changed.txt").write_text("test_long.py\n")
+    conftest = (tmp_path / "conftest.py").read_text()
+    stub = "selection.affected_files = lambda paths: paths\n"
+    (tmp_path / "conftest.py").write_text(conftest + stub)
+    assert run("-n", workers, "--changed=changed.txt")[-1].startswith("2 passed")
+
+
 @pytest.mark.parametrize(("reason", "code"), [("moto[server,s3]", 0), ("it is Sunday", 1)])
 def test_other_skip_than_those_allowed_fails_the_run(run, tmp_path: Path, reason: str, code: int) -> None:
     (tmp_path / "test_short.py").write_text(f"import pytest\ndef test_skip():\n    pytest.skip({reason!r})\n")

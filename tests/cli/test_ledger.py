@@ -28,7 +28,7 @@ def test_the_log_of_a_run_is_what_its_buses_saw(dxlrun: Callable, torso: Path, *
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (("port:=/dev/ttyUSB9", "--ledger", "seen.jsonl"), "what simulated buses saw"),
+        (("port:=/dev/ttyUSB9", "--ledger", "seen.jsonl"), "--ledger needs simulated buses"),
         (("--ledger", "missing/seen.jsonl"), "missing/seen.jsonl cannot be written"),
         (("--ledger", "."), "cannot be written"),
         (("--ledger", "letter.txt"), "letter.txt cannot be written (it exists)"),

@@ -19,6 +19,7 @@ from collections.abc import Collection, Generator, Iterable, Iterator
 from pathlib import Path
 
 import pytest
+from xdist.workermanage import WorkerController
 
 ROOT = Path(__file__).parents[2]
 LIBRARIES = ("dxlrun", "dxlsim", "dxlwire")
@@ -126,10 +127,15 @@ class Selection:
         campaigns = config.getoption("--campaigns") or config.getoption("--campaign") != "ci"
         self._everything = named or campaigns or config.getoption("--all")
         self._left_out: Counter[str] = Counter()
-        changed = config.getoption("--changed")
-        if changed and not hasattr(config, "workerinput"):
-            config.option.affected = [*affected_files(Path(changed).read_text("utf-8").split())]
-        self._affected = set(getattr(config.option, "affected", ()))
+        given = getattr(config, "workerinput", {}).get("affected")  # by the main process, in a worker
+        if given is None and (changed := config.getoption("--changed")):
+            given = [*affected_files(Path(changed).read_text("utf-8").split())]
+        self._affected = set(given or ())
+
+    @pytest.hookimpl(optionalhook=True)
+    def pytest_configure_node(self, node: WorkerController) -> None:
+        """Hand the affected files to a worker."""
+        node.workerinput["affected"] = sorted(self._affected)
 
     @pytest.hookimpl(tryfirst=True)
     def pytest_collection_modifyitems(self, config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -152,7 +158,7 @@ class Selection:
             self._left_out["long" if long else "campaign" if item.get_closest_marker("campaign") else ""] += 1
 
     @pytest.hookimpl(optionalhook=True)
-    def pytest_testnodedown(self, node: object) -> None:
+    def pytest_testnodedown(self, node: WorkerController) -> None:
         """Take the counts of a worker: each has collected all tests."""
         self._left_out |= Counter(getattr(node, "workeroutput", {}).get("left_out", {}))
 

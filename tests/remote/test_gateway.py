@@ -122,7 +122,7 @@ WRONG = [
     ("POST", "/controllers", LOAD | {"joints": ["pan", "pan"]}, 422, "invalid", "more names joint pan twice; name it once"),
     ("POST", "/controllers", LOAD | {"joints": 3}, 422, "invalid", "more.joints is 3"),
     ("POST", "/controllers", LOAD | {"rate": "x"}, 422, "invalid", "is not a rate"),
-    ("POST", "/controllers", LOAD | {"active": True}, 422, "invalid", "load it, then switch to it"),
+    ("POST", "/controllers", LOAD | {"active": True}, 422, "invalid", "load more first, then switch to it"),
     ("POST", "/controllers", LOAD | {"fallback": "nun"}, 422, "invalid", "the fallback nun of more is not a controller"),
     ("POST", "/controllers", LOAD | {"fallback": "more"}, 422, "invalid", "more is its own fallback; name another"),
     ("POST", "/controllers", LOAD | {"into": "lefty"}, 422, "invalid", "`into` of more names an unknown controller lefty; did you mean left?"),

@@ -234,15 +234,15 @@ def test_the_torso_moves():
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        (ONE.replace('<parent link="base"/>', ""), "MuJoCo cannot take the URDF: "),
-        (ONE.replace("</robot>", ""), "MuJoCo cannot take the URDF: "),
+        (ONE.replace('<parent link="base"/>', ""), "MuJoCo cannot load the URDF: "),
+        (ONE.replace("</robot>", ""), "MuJoCo cannot load the URDF: "),
         (
             ONE.replace("shoulder", "schulter"),
-            "no hinge of the URDF has the name of a joint of the robot file; give",
+            "hinges of the URDF and joints of the robot file have different names; use",
         ),
         (
             ONE.replace("revolute", "fixed"),
-            "no hinge of the URDF has the name of a joint of the robot file; give",
+            "hinges of the URDF and joints of the robot file have different names; use",
         ),
     ],
 )

@@ -106,7 +106,7 @@ def test_targets_choose_joints_in_their_order_and_what_no_controller_takes_is_re
         arm, hand = ("arm", "elbow"), ("hand", "wrist")
         assert named == {(): [arm, hand], ("both",): [hand, arm], ("hand", "elbow"): [hand, arm]}
         for wrong in ("spare", "knee"):
-            with pytest.raises(InputError, match=f"no active controller of driven takes .* for {wrong}; "):
+            with pytest.raises(InputError, match=f"no active controller of driven accepts .* for {wrong}; "):
                 banks_of(client, (wrong,), 8)
         (slot,) = banks_of(client, ("elbow",), 8)[0].slots
         assert (slot.lower, slot.upper) == pytest.approx((-math.pi / 6, math.pi / 6))
