@@ -39,7 +39,7 @@ def _run(tmp_path: Path):
 def test_whole_suite_leaves_out_long_tests_and_reports_it_last(run, workers: str) -> None:
     *_, passed, last = run("-n", workers)
     assert passed.startswith("1 passed")
-    assert last == "left out: 1 long tests that no change can break (--all runs them)"
+    assert last == "left out: 1 long tests that no given change needs (--all runs them)"
 
 
 def test_options_are_known_where_the_whole_suite_runs(tmp_path: Path) -> None:

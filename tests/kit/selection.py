@@ -171,7 +171,7 @@ class Selection:
         if output is not None:
             return
         reasons = {
-            "long": "long tests that no change can break (--all runs them)",
+            "long": "long tests that no given change needs (--all runs them)",
             "campaign": "campaigns that run at night or for a release (--campaigns lists them)",
         }
         parts = [f"{self._left_out[key]} {text}" for key, text in reasons.items() if self._left_out[key]]
