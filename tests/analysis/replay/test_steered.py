@@ -312,8 +312,8 @@ def test_nothing_is_compared_behind_a_lost_command_for_the_loop_or_cycles_around
     report = replay_log(lost)
     assert (report.compared, report.different) == (30, 0)
     assert report.stopped.startswith(
-        "the log lacks a command of cycle 30 (1 record of loop/commands was overwritten or damaged "
-        "before the recorder read it)"
+        "the log lacks a command of cycle 30 (1 record of loop/commands lost: overwritten or damaged before "
+        "reading)"
     )
     report = replay_log(changed(tell("rates"), without(*range(18, 24))))  # the rate changes in cycle 20
     assert (report.compared, report.different) == (18, 0)
