@@ -11,7 +11,6 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 import msgspec
 
 from dxlrun.channels.answers import Code, Field, Refusal
-from dxlrun.control import texts
 from dxlrun.control.controllers.update_order import Plans, below, commander, lowers_first, uppers_first
 from dxlrun.plan.loop_plan import ControllerPlan, JointPlan
 from dxlwire.modes import Mode, mode_of
@@ -154,6 +153,9 @@ class ControllerSnapshot(msgspec.Struct, frozen=True):
         for name in deactivate:
             upper = commander(name, [*staying.values(), *(() if name in activate else fresh)])
             if upper:
+                # Imported here because the compiler shares this module, and has no use for texts of events.
+                from dxlrun.control import texts
+
                 hint = texts.deactivate_upper(upper)
                 return Refusal(Code.COMMANDED, {"controller": name, "upper": upper, "hint": hint})
         for lower in (lower for name in enter for lower in known[name].into):
