@@ -13,10 +13,11 @@ from tests.kit.browser import CHROMIUM, Browser
 from tests.kit.torso import GOAL_POSITION, JOINT, SERVO, TORQUE_ENABLE, Run
 from tests.view.served import Served
 
+from dxlrun.tooling.live import JointServo
 from dxlrun_view.curves import Curve, Moment
 from dxlrun_view.live_robot import LiveRobot
 from dxlrun_view.recorded_robot import RecordedRobot
-from dxlrun_view.shown import LiveEvent, SourceProperties, ViewedController, ViewedRobot, ViewedServo
+from dxlrun_view.shown import LiveEvent, SourceProperties, ViewedController, ViewedRobot
 
 Serve = Callable[..., Served]
 VISIBLE = "(selector => document.querySelector(selector).offsetParent !== null)"
@@ -148,7 +149,7 @@ class Scripted:
         arm = ViewedController("arm", "position_controller", True, ("elbow_joint",), ("position",))
         began = bool(self.values)
         limits = dict.fromkeys(self.names, (-2.6, 0.17))
-        servos = {"wrist_joint": ViewedServo("XM430-W350", 2.0, 80.0)}
+        servos = {"wrist_joint": JointServo("XM430-W350", 2.0, 80.0)}
         info = ViewedRobot(
             "arm", 50.0, 0.0, joints=self.names, limits=limits, controllers=(arm,), servos=servos
         )

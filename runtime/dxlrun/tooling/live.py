@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from dxlrun.remote.client import Executed as Executed
     from dxlrun.remote.live.live_messages import LiveMessages as LiveMessages
     from dxlrun.remote.live.states import RobotStates as RobotStates
+    from dxlrun.remote.named.named_joints import joint_servos as joint_servos
     from dxlrun.remote.network.certificates import CLIENT as CLIENT
     from dxlrun.remote.network.certificates import client_context as client_context
     from dxlrun.remote.network.certificates import keys_place as keys_place
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from dxlrun.remote.network.robots_file import ListedAddress as ListedAddress
     from dxlrun.remote.requests.replies import ControllerInfo as ControllerInfo
     from dxlrun.remote.requests.replies import Events as Events
+    from dxlrun.remote.requests.replies import JointServo as JointServo
     from dxlrun.remote.requests.replies import Parameter as Parameter
     from dxlrun.remote.requests.replies import RobotInfo as RobotInfo
     from dxlrun.remote.requests.request_table import Role as Role

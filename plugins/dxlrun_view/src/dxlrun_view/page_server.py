@@ -167,10 +167,10 @@ class Page:
             return _refused(
                 404, "the page has no bundle; install it again: pip install ./plugins/dxlrun_view"
             )
-        # The page needs the kind of source before its first request has an answer.
-        kind = b"live" if self.source.describe_page().live else b"log"
         content = where.read_bytes()
-        content = content if name else content.replace(b'data-opens=""', b'data-opens="%s"' % kind)
+        if not name:  # The page needs the kind of source before its first request has an answer.
+            kind = b"live" if self.source.describe_page().live else b"log"
+            content = content.replace(b'data-opens=""', b'data-opens="%s"' % kind)
         return Response(content, media_type=_TYPES[name])
 
     async def serve_data(self, request: Request) -> Response:

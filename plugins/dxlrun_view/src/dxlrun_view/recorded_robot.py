@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun import DxlrunError, LogError, open_log
+from dxlrun.tooling.live import joint_servos
 from dxlrun.tooling.plans import Plan, from_json
 from dxlrun.tooling.records import Event
 from dxlrun.tooling.topics import BUS_PREFIX, LogTopic
@@ -31,7 +32,6 @@ from dxlrun_view.shown import (
     TimelineMark,
     ViewedController,
     ViewedRobot,
-    ViewedServo,
 )
 
 MOST_CYCLES = 100_000
@@ -230,12 +230,7 @@ class RecordedRobot:
                 if joint.servo_model is not None
             },
             limits={joint.name: (joint.lower, joint.upper) for joint in joints if joint.bounded},
-            servos={
-                joint.name: ViewedServo(servo.model, bus.protocol, model.temperature_limit if model else None)
-                for joint in joints
-                for model in (joint.servo_model,)
-                for bus, servo in plan.servos_by_joint.get(joint.name, ())[:1]
-            },
+            servos=joint_servos(plan),
             controllers=tuple(
                 msgspec.convert(controllers.get(row.name, row), ViewedController, from_attributes=True)
                 for row in info.controllers

@@ -12,6 +12,7 @@ from typing import Protocol
 
 import msgspec
 
+from dxlrun.tooling.live import JointServo
 from dxlrun_view.curves import Curve, Moment
 from dxlwire import find_table
 
@@ -31,15 +32,6 @@ class ViewedController(msgspec.Struct, frozen=True):
     """Controller that takes over when this one fails; empty without one"""
     goals: tuple[str, ...] = ()
     """Kinds of its commands that are goals, which end when they are reached"""
-
-
-class ViewedServo(msgspec.Struct, frozen=True):
-    """First servo of a joint, as in RobotInfo"""
-
-    model: str
-    protocol: float
-    temperature_limit: float | None = None
-    """Temperature above which the servo cuts its torque, degrees C; None if unknown"""
 
 
 class ViewedRobot(msgspec.Struct, frozen=True):
@@ -64,7 +56,7 @@ class ViewedRobot(msgspec.Struct, frozen=True):
     controllers: tuple[ViewedController, ...] = ()
     file: str = ""
     """Path of the robot file"""
-    servos: Mapping[str, ViewedServo] = {}
+    servos: Mapping[str, JointServo] = {}
     """First servo of each joint"""
 
 
@@ -91,7 +83,7 @@ class TimelineMark(msgspec.Struct, frozen=True):
     """Label of the mark"""
 
 
-def describe_error(servo: ViewedServo | None, value: int) -> str:
+def describe_error(servo: JointServo | None, value: int) -> str:
     """Return a hardware error in the words of the servo's control table, such as `overload error`."""
     if servo is not None:
         # A model of a plug-in that is not installed here has no table.
