@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
-from tests.kit import selection
+from tests.kit import selection, skips
 
 ROOT = Path(__file__).parents[1]
 SHORT = "def test_short():\n    pass\n"
@@ -81,6 +82,15 @@ def test_other_skip_than_those_allowed_fails_the_run(run, tmp_path: Path, reason
         assert any("not allowed to skip: test_short.py::test_skip" in line for line in lines) == bool(code)
 
 
+@pytest.mark.parametrize("pattern", skips.ALLOWED)
+def test_allowed_skip_is_one_of_the_tests(pattern: str) -> None:
+    source = "".join(
+        path.read_text("utf-8") for path in ROOT.glob("tests/**/*.py") if path.name != "skips.py"
+    )
+    marked = " ".join(f"needs dxlrun[{extra}]" for extra in re.findall(r"mark\.needs\(\"(\w+)\"\)", source))
+    assert re.search(pattern, f"{source} {marked}")
+
+
 @pytest.mark.parametrize(
     ("path", "rooms"),
     [
@@ -110,5 +120,18 @@ def test_changed_test_and_users_of_changed_kit_run() -> None:
 
 def test_each_room_has_its_long_tests() -> None:
     files = [path for path, _ in selection.long_files()]
-    assert {selection.folder_of(path) for path in files} == set(selection.TESTED)
+    assert {selection.folder_of(path) for path in files} <= set(selection.TESTED)
     assert len(files) > 50
+
+
+def test_each_folder_of_tests_is_about_rooms_that_exist() -> None:
+    folders = {one.name for one in (ROOT / "tests").iterdir() if any(one.glob("**/test_*.py"))} - {"faults"}
+    assert folders <= set(selection.TESTED)
+    product = {
+        one.relative_to(ROOT).as_posix()
+        for base in ("runtime", "plugins")
+        for one in (ROOT / base).rglob("*.py")
+    }
+    rooms = {selection.room_of(selection.module_of(path)) for path in product} | {"dxlrun.features"}
+    named = {room for rooms_of_folder in selection.TESTED.values() for room in rooms_of_folder}
+    assert named - rooms <= {"docs", "robots", "tests.bench", "example"}

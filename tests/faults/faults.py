@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import argparse
 import re
+import signal
 import subprocess
 import sys
 from collections import Counter
@@ -28,23 +29,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 ROOT = Path(__file__).parents[2]
+sys.path.insert(0, str(ROOT))  # as a program, its own folder is the first
+
+from tests.kit import selection  # noqa: E402  in the repository, not in the folder of this program
+
 FOLDER = Path(__file__).parent
-TESTS = {
-    "dxlwire": ("tests/dxlwire", "tests/dynamixel"),
-    "dxlsim": ("tests/dxlsim", "tests/simulation"),
-    "features/sensors": ("tests/sensors", "tests/features"),
-    "features/mechanics": ("tests/mechanics", "tests/features"),
-    "features": ("tests/features", "tests/dynamixel", "tests/control"),
-    "channels": ("tests/run/channels", "tests/remote", "tests/control"),
-    "contract": ("tests/control", "tests/plugins"),
-    "plan": ("tests/compile", "tests/control"),
-    "output": ("tests/cli",),
-    "messages": ("tests/log",),
-    "testing": ("tests/plugins",),
-    "tooling": ("tests/cli",),
-    "controllers": ("tests/plugins", "tests/robots"),
-}
-"""Tests of a room that is not named like their folder."""
 
 
 class Fault(NamedTuple):
@@ -86,13 +75,10 @@ def problems(fault: Fault) -> Iterator[str]:
         yield f"{fault.path}: {fault.effect!r} changes nothing"
 
 
-def tests_of(path: str) -> tuple[str, ...]:
+def tests_of(path: str) -> list[str]:
     """Return the tests of the room of a file."""
-    parts = Path(path).parts[1:]
-    room = "/".join(parts[1:3]) if parts[1] == "features" else parts[1] if parts[0] == "dxlrun" else parts[0]
-    room = room.removeprefix("dxlrun_")
-    found = next((TESTS[key] for key in (room, room.partition("/")[0]) if key in TESTS), (f"tests/{room}",))
-    return tuple(folder for folder in found if (ROOT / folder).is_dir())
+    folders = selection.tests_of(selection.room_of(selection.module_of(path)))
+    return [f"tests/{folder}" for folder in folders if (ROOT / "tests" / folder).is_dir()]
 
 
 def run_tests(words: Sequence[str]) -> str:
@@ -144,6 +130,7 @@ def main() -> None:
         "--deep", action="store_true", help="run all short tests where those of the room pass"
     )
     options = parser.parse_args()
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # takes the fault back, as Ctrl-C does
     for name in options.files:
         path = FOLDER / name
         faults = [*parsed(path.read_text("utf-8"))]

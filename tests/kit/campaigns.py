@@ -26,7 +26,7 @@ from hypothesis import is_hypothesis_test, seed, settings
 
 
 class Level(StrEnum):
-    """How long campaigns run."""
+    """Level of a run, which decides the counts of its campaigns."""
 
     CI = "ci"  # at each landing: seconds
     NIGHT = "night"  # some hours for all of them

@@ -26,22 +26,34 @@ LIBRARIES = ("dxlrun", "dxlsim", "dxlwire")
 TESTED = {
     "analysis": ("dxlrun_analysis",),
     "bench": ("tests.bench", "dxlwire"),
-    "cli": ("dxlrun.cli", "docs", "robots"),
-    "control": ("dxlrun.control",),
-    "dynamixel": ("dxlrun.dynamixel", "dxlwire"),
+    "cli": ("dxlrun.cli", "dxlrun.output", "dxlrun.tooling", "docs", "robots"),
+    "compile": ("dxlrun.compile", "dxlrun.plan"),
+    "control": ("dxlrun.control", "dxlrun.contract", "dxlrun.plan"),
+    "description": ("dxlrun.description",),
+    "dxlsim": ("dxlsim",),
+    "dxlwire": ("dxlwire",),
+    "dynamixel": ("dxlrun.dynamixel", "dxlrun.features.registers", "dxlrun.features.devices", "dxlwire"),
+    "features": ("dxlrun.features",),
+    "fleet": ("dxlrun_fleet",),
+    "foreign": ("dxlsim",),
+    "foxglove": ("dxlrun_foxglove",),
     "hand": ("dxlrun_hand",),
     "lab": ("dxlrun_lab",),
-    "log": ("dxlrun.log",),
+    "lights": ("lights",),
+    "log": ("dxlrun.log", "dxlrun.messages"),
     "mechanics": ("dxlrun.features.mechanics",),
     "phidget": ("phidget",),
-    "plugins": ("dxlrun_controllers", "example", "docs"),
+    "plugins": ("dxlrun_controllers", "dxlrun.contract", "dxlrun.testing", "example", "docs"),
+    "remote": ("dxlrun.remote", "dxlrun.channels"),
     "robots": ("robots", "dxlrun_controllers", "dxlrun.control", "dxlrun.run"),
-    "run": ("dxlrun.run", "dxlrun.control"),
+    "ros2": ("dxlrun_ros2",),
+    "run": ("dxlrun.run", "dxlrun.channels", "dxlrun.control"),
+    "sensors": ("dxlrun.features.sensors",),
     "simulation": ("dxlsim",),
     "teleop": ("dxlrun_teleop",),
     "view": ("dxlrun_view",),
 }
-"""Rooms that the long tests of a folder test."""
+"""Rooms that a folder of tests is about; `dxlrun.features` is each feature."""
 
 
 def room_of(module: str) -> str:
@@ -61,8 +73,16 @@ def module_of(path: str) -> str:
 
 
 def is_face(module: str) -> bool:
-    """Check for a module that only passes on names, so that its importers import what is behind it."""
+    """Return True for a module that only re-exports names of other modules."""
     return module in LIBRARIES or room_of(module) in {"dxlrun.tooling", "dxlrun.testing"}
+
+
+def tests_of(room: str) -> list[str]:
+    """Return the folders of tests that are about a room, the one with its name first."""
+    above = room.rpartition(".")[0]
+    names = {room, above} if above == "dxlrun.features" else {room}
+    found = [folder for folder, rooms in TESTED.items() if not names.isdisjoint(rooms)]
+    return sorted(found, key=lambda folder: folder != room.rpartition(".")[2].removeprefix("dxlrun_"))
 
 
 def affected_rooms(paths: Iterable[str]) -> set[str]:
