@@ -87,7 +87,10 @@ class Robot:
     def events(self, after: int) -> dict[str, Any]:
         one = {"name": "gate", "source": "arm", "text": "something\nhappened " + "x" * 200}
         number = after + 1
-        return {"events": [{"number": number, "time": 100.0, "severity": 40, **one}], "last": number}
+        return {
+            "events": [{"number": number, "time": 100.0, "severity": 40, "origin": "", **one}],
+            "last": number,
+        }
 
 
 @pytest.fixture
@@ -202,12 +205,7 @@ def test_the_newest_event_stands_last() -> None:
     watched = watch.WatchedRobot(Robot())  # type: ignore[arg-type]  # a stand-in
     watched.poll_robot()
     event = {"severity": 20, "source": "loop", "name": "steered"}
-    texts = {
-        1.0: "1.0",
-        2.0: "2.0",
-        3.0: "pause from loop",
-        4.0: "resume from loop",
-    }  # the last: of each start
-    watched.events = [{**event, "time": at, "text": text} for at, text in texts.items()]
+    origins = {1.0: "anna", 2.0: "anna", 3.0: "loop", 4.0: "loop"}  # the last two are of each start
+    watched.events = [{**event, "time": at, "text": str(at), "origin": who} for at, who in origins.items()]
     assert watch.event_lines(watched, 0) == []
     assert watch.event_lines(watched, 1) == [Sentence(" 99.0 s ago, loop: 2.0", "plain")]

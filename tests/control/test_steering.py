@@ -280,8 +280,15 @@ def test_a_stream_that_ends_without_a_word_is_held_until_the_next_command(steere
     assert again == [-1, 9], "its commands are of another time"
     held = ("left", "the stream of commands ended; its joints are held")
     assert steered.events.of(EventCode.STALE_COMMAND) == [held]
+    assert steered.events.data_of(EventCode.STALE_COMMAND) == [b'{"held":true}']
     assert np.isnan(steered.sink.cycles[7]["position"]).tolist() == [True, False]
     assert steered.active(7) == ["left", "right"]
+
+
+def test_a_stream_that_ends_the_run_by_its_policy_is_not_reported_as_held(steered):
+    steered.run(15, {1: steered.posts("left", "position", b"", 2 * PERIOD_NS)}, policies=STRICT)
+    (data,) = steered.events.data_of(EventCode.STALE_COMMAND)
+    assert data == b'{"held":false}'
 
 
 def test_commands_of_a_stream_that_ended_stay_withheld_when_a_joint_regains_torque(steered):

@@ -114,9 +114,16 @@ def following(context: Any, *_: object) -> None:
 @dataclass
 class Events:
     seen: list[tuple[EventCode, Severity, str, str]] = field(default_factory=list)
+    data: list[bytes] = field(default_factory=list)
+    """Data of each event that was seen."""
 
     def emit_event(self, source: str, event: EventBody, data: bytes = b"") -> None:
         self.seen.append((event.code, event.severity, source, event.text))
+        self.data.append(data)
+
+    def data_of(self, code: EventCode) -> list[bytes]:
+        """Return the data of all events of a kind."""
+        return [data for seen, data in zip(self.seen, self.data, strict=True) if seen[0] == code]
 
     def of(self, code: EventCode) -> list[tuple[str, str]]:
         return [(source, text) for seen, _, source, text in self.seen if seen == code]

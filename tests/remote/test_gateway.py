@@ -15,7 +15,7 @@ from msgspec.structs import replace
 from pydantic import create_model
 from tests.kit.pages import page_text
 
-from dxlrun.channels.answers import Acceptance, Code, Completion, Refusal
+from dxlrun.channels.answers import Acceptance, Code, CommandOutcome, Completion, Refusal
 from dxlrun.channels.commands import MOST_PER_CYCLE
 from dxlrun.channels.cycle import CycleLayout, CycleRecord
 from dxlrun.channels.event_records import EventBody, EventCode, Severity
@@ -577,6 +577,17 @@ def test_states_show_the_references_by_their_names(desk):
     desk.finish_cycle()
     found = desk.ask("GET", "/states")[1]
     assert (found["references"], found["reference"]) == ([*names], [0.25, None])
+
+
+def test_event_of_a_command_has_its_client(desk):
+    outcome = msgspec.json.encode(CommandOutcome("rate", "anna"))
+    desk.events.emit_event(
+        "loop", EventBody(EventCode.STEERED, Severity.INFO, "rate 40 Hz from anna"), outcome
+    )
+    desk.events.emit_event("loop", EventBody(EventCode.STEERED, Severity.INFO, "of a version without data"))
+    desk.events.emit_event("loop", EventBody(EventCode.SETUP, Severity.INFO, "no command"), outcome)
+    desk.link.collect_messages()
+    assert [one["origin"] for one in desk.ask("GET", "/events")[1]["events"]] == ["anna", "", ""]
 
 
 def test_events_of_both_processes_are_returned_whole_and_once(desk):

@@ -20,6 +20,8 @@ from dxlrun.channels.ring import RING_SECONDS, Appender, RecordKind, record_size
 
 LOOP = ""
 """Controller name that addresses a command to the loop itself; not a valid name of a controller."""
+OWN_ORIGIN = "loop"
+"""Origin of commands that the run sends itself, such as the pause of a start."""
 
 MOST_PER_CYCLE = 8
 """Most client commands that the loop executes in a cycle; more wait for the next one."""

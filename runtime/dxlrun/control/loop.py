@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun.channels.commands import LOOP, TakenCommand
+from dxlrun.channels.commands import LOOP, OWN_ORIGIN, TakenCommand
 from dxlrun.channels.cycle import CycleRecord, Torque
 from dxlrun.channels.event_records import EventSink
 from dxlrun.control import texts
@@ -273,7 +273,7 @@ class ControlLoop:
     def _log_policy(self, name: str, text: str) -> None:
         self.context.events.emit_event("loop", texts.policy_begins(name, text))
         data = f'{{"policy":"{name}"}}'.encode()
-        begun = TakenCommand(self.record.woken_ns, self.schedule.cycle, -1, LOOP, "policy", "loop", data)
+        begun = TakenCommand(self.record.woken_ns, self.schedule.cycle, -1, LOOP, "policy", OWN_ORIGIN, data)
         self.context.command_log.record_command(begun)
 
     def _next(self) -> bool:

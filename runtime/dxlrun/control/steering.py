@@ -153,14 +153,15 @@ class Steering:
                 )
             )
             answer: Answer | None
+            words = ""
             if for_loop := command.controller == LOOP:
-                answer = self._for_loop(command)
+                answer, words = self._for_loop(command)
             else:
                 found = manager.dispatch_command(command)
                 goals = (found,) if isinstance(found, int) and found else ()
                 answer = found if isinstance(found, Refusal) else Completion(record.cycle, goals=goals)
             if for_loop or isinstance(answer, Refusal):
-                self._report_command(command, answer, place)
+                self._report_command(command, answer, place, words)
             if for_loop and self.paused:
                 self.paused_until_ns = record.woken_ns + PAUSE_LEASE_NS
             count += not (for_loop or isinstance(answer, Refusal))
@@ -280,24 +281,28 @@ class Steering:
 
     # Commands
 
-    def _for_loop(self, command: CommandMessage) -> Answer | None:
-        """Decode and execute a command for the loop itself; return its answer, None if that comes later."""
+    def _for_loop(self, command: CommandMessage) -> tuple[Answer | None, str]:
+        """Decode and execute a command for the loop itself.
+
+        Returns its answer, None if that comes later, and its data as text for the event.
+        """
         kind, data, numbers = command.kind, command.data, b""
         if kind not in FORMS:
             problem = texts.unknown_loop_command(kind, FORMS)
-            return Refusal(Code.INVALID, {"problem": problem})
+            return Refusal(Code.INVALID, {"problem": problem}), ""
         if kind in ("load", "unload") and not self.paused:
-            return Refusal(Code.NOT_IN_PAUSE)
+            return Refusal(Code.NOT_IN_PAUSE), ""
         if kind == "play":
             data, _, numbers = data.partition(b"\n")
         form = FORMS[kind]
         try:
             request = None if form is None else msgspec.json.decode(data, type=form)
         except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-            return Refusal(Code.INVALID, {"problem": texts.wrong_command_data(kind, error)})
+            return Refusal(Code.INVALID, {"problem": texts.wrong_command_data(kind, error)}), ""
+        words = request.name if isinstance(request, ControllerPlan) else getattr(request, "words", "")
         if isinstance(request, TorqueRequest | RebootRequest | Register | RegisterReading):
-            return self.joints.execute_request(command.number, request)
-        return self._execute(command, request, numbers) or Completion(self._record.cycle)
+            return self.joints.execute_request(command.number, request), words
+        return self._execute(command, request, numbers) or Completion(self._record.cycle), words
 
     def _execute(
         self, command: CommandMessage, request: msgspec.Struct | None, numbers: bytes
@@ -338,7 +343,7 @@ class Steering:
 
     # Reports
 
-    def _report_command(self, command: CommandMessage, answer: Answer | None, place: int) -> None:
+    def _report_command(self, command: CommandMessage, answer: Answer | None, place: int, words: str) -> None:
         """Emit an event for a refused command or a command for the loop.
 
         `Manager` reports accepted ones for controllers.
@@ -349,15 +354,9 @@ class Steering:
             event = texts.command_refused(command.kind, command.origin, refusal.text)
         else:
             source = "loop"
-            event = texts.loop_steered(_shown(command), command.origin)
+            shown = f"{command.kind} {words}".strip()
+            if len(shown) > LONGEST_SHOWN:
+                shown = f"{shown[:LONGEST_SHOWN]} ..."
+            event = texts.loop_steered(shown, command.origin)
         data = msgspec.json.encode(CommandOutcome(command.kind, command.origin, refusal, place))
         self._context.events.emit_event(source, event, data)
-
-
-def _shown(command: CommandMessage) -> str:
-    """Return an executed command for the loop as text, such as `rate 40 Hz`; the log has all its data."""
-    form = FORMS[command.kind]
-    request = None if form is None else msgspec.json.decode(command.data.partition(b"\n")[0], type=form)
-    words = request.name if isinstance(request, ControllerPlan) else getattr(request, "words", "")
-    shown = f"{command.kind} {words}".strip()
-    return shown if len(shown) <= LONGEST_SHOWN else f"{shown[:LONGEST_SHOWN]} ..."

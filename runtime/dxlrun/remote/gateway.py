@@ -27,9 +27,10 @@ from starlette.requests import ClientDisconnect
 from starlette.responses import Response, StreamingResponse
 from starlette.routing import Route
 
-from dxlrun.channels.answers import Code, Completion, Field, Refusal
+from dxlrun.channels.answers import Code, CommandOutcome, Completion, Field, Refusal
 from dxlrun.channels.commands import LOOP
 from dxlrun.channels.cycle import LIMP, CycleRecord
+from dxlrun.channels.event_records import Event, EventCode
 from dxlrun.channels.heartbeat import Phase
 from dxlrun.channels.loop_requests import (
     Cancel,
@@ -324,7 +325,7 @@ class GatewayApp:
         """Return the stored events with a number above `after`; `last` is the newest event's number."""
         after, kept = asked.number("after", 0.0), self._link.events
         rows = (
-            EventRow(number, one.t_ns * 1e-9, one.name, one.severity, one.source, one.text)
+            EventRow(number, one.t_ns * 1e-9, one.name, one.severity, one.source, one.text, _origin(one))
             for number, one in kept
             if number > after
         )
@@ -751,6 +752,13 @@ def _mistaken(error: InputError) -> dict[str, Field]:
         "problems": tuple(one.what for one in found),
         "fixes": tuple(one.fix for one in found),
     }
+
+
+def _origin(event: Event) -> str:
+    """Return the client whose command an event reports; empty for other events."""
+    if event.code not in (EventCode.STEERED, EventCode.COMMAND_REFUSED) or not event.data:
+        return ""
+    return msgspec.json.decode(event.data, type=CommandOutcome).origin
 
 
 def _refused(refusal: Refusal) -> Response:

@@ -13,7 +13,7 @@ from functools import lru_cache
 import msgspec
 
 from dxlrun.channels.answers import Acceptance, Answer, Code, Completion, Refusal
-from dxlrun.channels.commands import LONGEST_COMMAND, LOOP, CommandMessage
+from dxlrun.channels.commands import LONGEST_COMMAND, LOOP, OWN_ORIGIN, CommandMessage
 from dxlrun.channels.cycle import CycleRecord
 from dxlrun.channels.event_records import Event, EventCode
 from dxlrun.channels.heartbeat import Heartbeat, Phase
@@ -122,7 +122,7 @@ class Link:
         stop it.
         """
         if self._mailbox.used:
-            self._mailbox.post_command(CommandMessage(0, LOOP, "resume", b"", "loop"))
+            self._mailbox.post_command(CommandMessage(0, LOOP, "resume", b"", OWN_ORIGIN))
 
     # State
 

@@ -30,7 +30,7 @@ from dxlrun.channels.child_processes import (
     RunMemory,
     Stop,
 )
-from dxlrun.channels.commands import LOOP, CommandMessage
+from dxlrun.channels.commands import LOOP, OWN_ORIGIN, CommandMessage
 from dxlrun.channels.heartbeat import GatewayAvailability, Heartbeat, Phase
 from dxlrun.channels.kept import KeptStates
 from dxlrun.channels.mailbox import MailboxWriter
@@ -238,7 +238,7 @@ class _Run:
         """Post a pause, with which a loop that waits for the gateway begins; the gateway ends it."""
         # Nothing else writes into the mailbox before the gateway.
         if self.held:
-            MailboxWriter(self.memory.mailbox).post_command(CommandMessage(0, LOOP, "pause", b"", "loop"))
+            MailboxWriter(self.memory.mailbox).post_command(CommandMessage(0, LOOP, "pause", b"", OWN_ORIGIN))
 
     def discard(self) -> None:
         """Remove the log of a run that sent nothing to the robot."""

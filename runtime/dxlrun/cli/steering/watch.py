@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, cast
 
+from dxlrun.channels.commands import OWN_ORIGIN
 from dxlrun.cli.inputs import Flag
 from dxlrun.cli.steering.steer import ONLY_ONE, RobotChoice, Row, connect_robot, state
 from dxlrun.errors import DxlrunError, Refused
@@ -265,8 +266,11 @@ def event_lines(watched: WatchedRobot, most: int) -> list[Sentence]:
 
 
 def _belongs_to_start(event: Row) -> bool:
-    """Return whether an event reports the pause in which a run waits for its gateway, at every start."""
-    return event["name"] == "steered" and event["text"] in ("pause from loop", "resume from loop")
+    """Return whether an event reports the pause in which a run waits for its gateway, at every start.
+
+    The run itself has no other commands for the loop.
+    """
+    return bool(event["origin"] == OWN_ORIGIN)
 
 
 def snapshot(watched: WatchedRobot) -> tuple[Table | Sentence, ...]:

@@ -101,6 +101,8 @@ class EventRow(msgspec.Struct, frozen=True):
     severity: int
     source: str
     text: str
+    origin: str = ""
+    """Client that sent the command of a `steered` or `command_refused` event; empty for other events."""
 
 
 class Events(msgspec.Struct, frozen=True):
