@@ -13,7 +13,8 @@ in their place, and the result:
 
 The lines to replace occur once in the file; a fault whose lines are gone cannot be tried any more. The fault
 is applied to this checkout, which must be clean and installed with `pip install -e`, and is taken back at the
-end. The tests of its room run first; with `--deep` all that are short.
+end. The short tests of its room run, those first that name its module; with `--deep` then the whole suite.
+What takes longer than the limit has not found the fault: a test that nobody waits for finds nothing.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ sys.path.insert(0, str(ROOT))  # as a program, its own folder is the first
 from tests.kit import selection  # noqa: E402  in the repository, not in the folder of this program
 
 FOLDER = Path(__file__).parent
+LIMIT_S = 240.0
 
 
 class Fault(NamedTuple):
@@ -76,13 +78,19 @@ def problems(fault: Fault) -> Iterator[str]:
 
 
 def tests_of(path: str) -> list[str]:
-    """Return the tests of the room of a file."""
-    folders = selection.tests_of(selection.room_of(selection.module_of(path)))
-    return [f"tests/{folder}" for folder in folders if (ROOT / "tests" / folder).is_dir()]
+    """Return the short test files of the room of a product file, those first that name its module."""
+    module = selection.module_of(path)
+    long = {name for name, _ in selection.long_files()}
+    folders = selection.tests_of(selection.room_of(module))
+    files = [file for folder in folders for file in sorted((ROOT / "tests" / folder).rglob("test_*.py"))]
+    parent, _, name = module.rpartition(".")
+    names = re.compile(rf"\b({re.escape(module)}|from {re.escape(parent)} import .*\b{re.escape(name)})\b")
+    files.sort(key=lambda file: names.search(file.read_text("utf-8")) is None)
+    return [path for file in files if (path := str(file.relative_to(ROOT))) not in long]
 
 
 def run_tests(words: Sequence[str]) -> str:
-    """Return the first test that fails; empty if none does."""
+    """Return the first test that fails; empty if none does within the limit."""
     command = [
         sys.executable,
         "-m",
@@ -95,8 +103,16 @@ def run_tests(words: Sequence[str]) -> str:
         "no:cacheprovider",
         "--timeout=120",
     ]
-    ran = subprocess.run([*command, *words], cwd=ROOT, capture_output=True, text=True, check=False)
-    failed = re.search(r"^(?:FAILED|ERROR) (\S+)", ran.stdout, re.MULTILINE)
+    with subprocess.Popen(
+        [*command, *words], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    ) as ran:
+        try:
+            output, _ = ran.communicate(timeout=LIMIT_S)
+        except subprocess.TimeoutExpired:
+            ran.send_signal(signal.SIGINT)  # lets the tests end what they started
+            ran.communicate()
+            return ""
+    failed = re.search(r"^(?:FAILED|ERROR) (\S+)", output, re.MULTILINE)
     return failed[1] if failed else "" if ran.returncode == 0 else "tests end with an error"
 
 

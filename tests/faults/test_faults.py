@@ -43,17 +43,17 @@ def test_fault_that_cannot_be_applied_is_named(change: dict[str, str], problem: 
 @pytest.mark.parametrize(
     ("path", "first"),
     [
-        ("runtime/dxlwire/packets.py", "tests/dxlwire"),
-        ("runtime/dxlrun/features/sensors/check.py", "tests/sensors"),
-        ("runtime/dxlrun/features/mechanics/drives.py", "tests/mechanics"),
-        ("runtime/dxlrun/control/gate.c", "tests/control"),
-        ("runtime/dxlrun/plan/robot_plan.py", "tests/compile"),
-        ("plugins/dxlrun_controllers/pid_controller.py", "tests/plugins"),
-        ("plugins/dxlrun_lab/stress.py", "tests/lab"),
+        ("runtime/dxlwire/exceptions.py", "tests/dxlwire/"),
+        ("runtime/dxlrun/features/sensors/check.py", "tests/sensors/"),
+        ("runtime/dxlrun/features/mechanics/drives.py", "tests/mechanics/"),
+        ("runtime/dxlrun/control/gate.c", "tests/control/test_gate"),
+        ("runtime/dxlrun/plan/robot_plan.py", "tests/compile/"),
+        ("plugins/dxlrun_controllers/pid_controller.py", "tests/plugins/"),
+        ("plugins/dxlrun_lab/stress.py", "tests/lab/"),
     ],
 )
 def test_room_has_its_tests(path: str, first: str) -> None:
-    assert faults.tests_of(path)[0] == first
+    assert faults.tests_of(path)[0].startswith(first)
 
 
 @pytest.mark.parametrize("ends", ["", "tests/x.py::test_it", "interrupt"])
