@@ -6,7 +6,7 @@ import ast
 from collections import defaultdict
 from pathlib import Path
 
-from tests.bench.house import BARE_VERBS
+from bench.house import BARE_VERBS
 
 ROOT = Path(__file__).parents[1]
 CONTRACT = "public contract of controllers"

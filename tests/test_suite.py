@@ -89,11 +89,7 @@ def deadlines(source: str) -> list[int]:
 
 def test_deadlines_are_in_the_kit() -> None:
     """A deadline of its own makes a test fail on a busy machine: `until` and DEADLINE_S of kit/awaited.py."""
-    texts = {
-        str(path.relative_to(ROOT)): path.read_text()
-        for path in ROOT.glob("tests/**/*.py")
-        if "bench" not in path.parts
-    }
+    texts = {str(path.relative_to(ROOT)): path.read_text() for path in ROOT.glob("tests/**/*.py")}
     found = {path: lines for path, text in texts.items() if (lines := deadlines(text))}
     assert {path: lines for path, lines in found.items() if path not in DURATIONS} == {}
     assert set(found) == set(DURATIONS)
@@ -115,7 +111,7 @@ def test_deadline_is_found(source: str) -> None:
 
 def test_packages_that_the_import_linter_does_not_see_import_only_the_faces() -> None:
     """They are distributions of their own, with a folder `src`, and need not be installed here."""
-    house = loaded(ROOT / "tests/bench/house.py")
+    house = loaded(ROOT / "bench/house.py")
     names = list(house.imported_names(house.read_sources("")))
     own = {path.split("/")[1] for path, _, _ in names if "/src/" in path}
     assert own >= {"dxlrun_ros2", "dxlrun_view"}
@@ -192,7 +188,7 @@ def test_the_sdist_has_every_file_of_its_folders(tmp_path: Path) -> None:
 
 def test_variables_only_name_what_is_elsewhere() -> None:
     """Options and marks select tests; a variable has the place of something that is not in the repository."""
-    texts = [path.read_text() for path in ROOT.glob("tests/**/*.py") if "bench" not in path.parts]
+    texts = [path.read_text() for path in ROOT.glob("tests/**/*.py")]
     read = (
         r"(?:getenv\(|environ\.get\(|environ\[)\s*\"(DXLRUN_\w+)\"|\"(DXLRUN_\w+)\" (?:not )?in os\.environ"
     )

@@ -19,7 +19,7 @@ from exchange.rounds import WARM, measure
 ROOT = Path(__file__).parents[2]
 PAGE = page_text("bench.md")
 FLAT = " ".join(PAGE.split())
-PROGRAM = "python tests/bench/exchange"
+PROGRAM = "python bench/exchange"
 EXCHANGES = [
     line
     for path in sorted(ROOT.glob("docs/**/*.md"))

@@ -1,4 +1,4 @@
-"""Start-up: which modules a command imports; how long that takes is measured by tests/bench/startup.py."""
+"""Start-up: which modules a command imports; how long that takes is measured by bench/startup.py."""
 
 from __future__ import annotations
 

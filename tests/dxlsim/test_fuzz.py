@@ -1,6 +1,6 @@
 """Whatever a host sends, a bus does not fall over, and whatever it answers can be trusted.
 
-The campaign of 1,000,000 strings is tests/bench/fuzz_simulation.py; a seeded sample of it runs here.
+The campaign of 1,000,000 strings is bench/fuzz_simulation.py; a seeded sample of it runs here.
 """
 
 from __future__ import annotations
@@ -8,9 +8,9 @@ from __future__ import annotations
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from tests.bench import fuzz_simulation
 from tests.kit.packets import crc, packet1, packet2
 
+from bench import fuzz_simulation
 from dxlsim.wire.servo_protocol1 import ErrorBit
 
 LIKE_PACKETS = st.sampled_from([0xFF, 0xFD, 0xFE, 0x00, 0x01, 0x02, 0x03, 0x55, 0x74, 0x82, 0x83, 0x92])

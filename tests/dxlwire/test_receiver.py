@@ -175,7 +175,7 @@ def test_a_header_that_announces_more_than_anybody_says_holds_nothing_back():
 
 @both
 def test_a_sample_of_the_campaign(dialect):
-    """Of tests/bench/fuzz_receiver.py; the whole of it has 1,000,000 packets."""
+    """Of bench/fuzz_receiver.py; the whole of it has 1,000,000 packets."""
     tally = fuzz_receiver.campaign(dialect, 3_000, seed=7)
     assert tally.packets == 3_000
     assert tally.intact - tally.swallowed + tally.accidents == tally.delivered

@@ -25,7 +25,7 @@ ROOT = Path(__file__).parents[2]
 LIBRARIES = ("dxlrun", "dxlsim", "dxlwire")
 TESTED = {
     "analysis": ("dxlrun_analysis",),
-    "bench": ("tests.bench", "dxlwire"),
+    "bench": ("bench", "dxlwire"),
     "cli": ("dxlrun.cli", "dxlrun.output", "dxlrun.tooling", "docs", "robots"),
     "compile": ("dxlrun.compile", "dxlrun.plan"),
     "control": ("dxlrun.control", "dxlrun.contract", "dxlrun.plan"),
@@ -91,7 +91,7 @@ def affected_rooms(paths: Iterable[str]) -> set[str]:
 
     changed = [path for path in paths if path.startswith(("runtime/", "plugins/"))]
     rooms = {str(Path(path).parts[0]) for path in paths if path.startswith(("docs/", "robots/"))}
-    rooms |= {"tests.bench" for path in paths if path.startswith("tests/bench/")}
+    rooms |= {"bench" for path in paths if path.startswith("bench/")}
     modules = {module_of(path) for path in changed}
     rooms |= {room_of(module) for module in modules if module}
     packages = {one.parent.name for one in (ROOT / "plugins").glob("*/__init__.py")}

@@ -1,6 +1,6 @@
 """feed_forward on simulated servos: the thesis' motion with it and without, other motors, limits.
 
-`tests/bench/feed_forward.py` prints the table of the docs; here are its bounds.
+`bench/feed_forward.py` prints the table of the docs; here are its bounds.
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 from msgspec.structs import replace
-from tests.bench import feed_forward as bench
 from tests.kit.campaigns import campaign
 from tests.kit.clients import Ask, steered
 
+from bench import feed_forward as bench
 from dxlrun.description.joints.motor_file import motor_text
 from dxlrun.testing import read_log, simulated_robot
 from dxlrun_analysis.replay import replay_log

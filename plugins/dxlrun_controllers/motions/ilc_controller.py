@@ -35,7 +35,7 @@ LEAST: Final = math.radians(0.088)
 FADE_S: Final = 0.2
 """Shortest time in which one correction fades into another, s."""
 STEP_NS: Final = 15_000
-"""Duration of one step of learning, ns, measured by tests/bench/controllers.py."""
+"""Duration of one step of learning, ns, measured by bench/controllers.py."""
 SHARE: Final = 0.05
 """Fraction of a period that the steps of learning in one cycle may take."""
 _SAME: Final = 1e-6

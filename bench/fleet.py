@@ -5,7 +5,7 @@ An agent starts simulated joints at 32 Hz, each a run with processes of its own 
 those between all processes at once, as where power or network fails. The time ends when a frame of the
 table has its row as unreachable.
 
-    python tests/bench/fleet.py [--robots 10]
+    python bench/fleet.py [--robots 10]
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from dxlrun.remote.requests.request_table import Role
 from dxlrun_fleet import authority
 from dxlrun_fleet.fleet_file import read_fleet
 
-ROBOT = Path(__file__).parents[2] / "robots" / "single_joint.yaml"
+ROBOT = Path(__file__).parents[1] / "robots" / "single_joint.yaml"
 DXLRUN = Path(sys.executable).with_name("dxlrun")
 TERMINAL = {"TERM": "xterm", "COLUMNS": "160", "LINES": "60"}
 

@@ -1,7 +1,7 @@
 """Does a wheel work where nothing else is? Installs it in a system without a compiler and without a network.
 
-    python tests/bench/bare.py dist/dxlrun-0.1.0-py3-none-manylinux_2_17_x86_64.whl /tmp/debian
-    python tests/bench/bare.py WHEEL ROOT --python /opt/python/bin/python3 -- tests/description -k units
+    python bench/bare.py dist/dxlrun-0.1.0-py3-none-manylinux_2_17_x86_64.whl /tmp/debian
+    python bench/bare.py WHEEL ROOT --python /opt/python/bin/python3 -- tests/description -k units
 
 ROOT is a folder with the files of a system; where there is none yet, Debian 12 with its Python 3.11 is put
 there (debootstrap). pip fetches what dxlrun and its tests need for that system. Inside, in namespaces of its
@@ -30,7 +30,7 @@ echo "== dxlrun --version"; venv/bin/dxlrun --version
 echo "== a run"; cd sdist
 ../venv/bin/dxlrun robots/bioloid_torso.yaml --virtual --play robots/motions/three_parts.yaml
 rm -r runtime plugins/dxlrun_*  # what was installed is tested
-echo "== kernel and parser"; ../venv/bin/python tests/bench/fuzz_kernel.py 2000
+echo "== kernel and parser"; ../venv/bin/python bench/fuzz_kernel.py 2000
 echo "== tests"
 ../venv/bin/python -m pytest -q -n 0 -p no:cacheprovider $TESTS
 """

@@ -6,9 +6,9 @@ gives a ratio to the two beside it, of medians: of how late the loop woke up, an
 goals were sent. The interval is Student's, over the ratios' logarithms. Then clients connect, look, and die
 one after the other.
 
-    python tests/bench/beside_loop.py view [--robot robots/humanoid_20.yaml] [--blocks 20] [--seconds 20]
-    python tests/bench/beside_loop.py foxglove
-    DXLRUN_ROS2_PYTHON=PYTHON python tests/bench/beside_loop.py ros2
+    python bench/beside_loop.py view [--robot robots/humanoid_20.yaml] [--blocks 20] [--seconds 20]
+    python bench/beside_loop.py foxglove
+    DXLRUN_ROS2_PYTHON=PYTHON python bench/beside_loop.py ros2
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Protocol
 
-sys.path.insert(0, str(Path(__file__).parents[2]))
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import numpy as np
 from scipy.stats import t as student
@@ -42,7 +42,7 @@ import dxlrun
 from dxlrun.log.log_reader import read_log
 
 DXLRUN = Path(sys.executable).with_name("dxlrun")
-ROBOT = Path(__file__).parents[2] / "robots" / "humanoid_20.yaml"
+ROBOT = Path(__file__).parents[1] / "robots" / "humanoid_20.yaml"
 PERIOD_S = 0.04
 RECONNECTIONS = 50
 SETTLING_S = 4.0

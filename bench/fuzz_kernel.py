@@ -6,9 +6,9 @@ Lines are lost and come back, servos leave the exchange and join it, and idle ti
 each cycle everything that a run shows is compared: bytes sent, the log, states, ages, what is known of each
 servo, events. A stream is the bytes of one line after one read.
 
-    python tests/bench/fuzz_kernel.py 2000000 --seed 1 --processes 2
-    python tests/bench/fuzz_kernel.py 200000 --processes 2 --sanitized
-    python tests/bench/fuzz_kernel.py 100000 --digests
+    python bench/fuzz_kernel.py 2000000 --seed 1 --processes 2
+    python bench/fuzz_kernel.py 200000 --processes 2 --sanitized
+    python bench/fuzz_kernel.py 100000 --digests
 
 The last one writes a line for each robot, with the SHA-256 of all that it showed: the same on every machine.
 CI runs a seeded sample of it (tests/dynamixel/test_kernel.py).
@@ -33,7 +33,7 @@ from operator import itemgetter
 from pathlib import Path
 from zlib import crc32
 
-sys.path.insert(0, str(Path(__file__).parents[2]))
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import numpy as np
 from msgspec.structs import replace

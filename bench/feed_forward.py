@@ -1,6 +1,6 @@
 """How well simulated servos follow the thesis' motion with a feed-forward and without.
 
-    python tests/bench/feed_forward.py [--seconds 12]
+    python bench/feed_forward.py [--seconds 12]
 
 Prints RMS and greatest error (read minus desired, at the time of the reading), the lag with which the motion
 fits best, and the RMS error that is left of a motion that is later by that lag: what is no lag. Virtual time,
@@ -24,7 +24,7 @@ from dxlrun import MotorLoad, MotorModel
 from dxlrun.description.joints.motor_file import motor_text, read_motor
 from dxlrun.testing import Log, read_log, simulated_robot
 
-ROBOTS = Path(__file__).parents[2] / "robots"
+ROBOTS = Path(__file__).parents[1] / "robots"
 MOTION = ROBOTS / "motions/single_joint_tracking.yaml"
 MX64 = read_motor(ROBOTS / "motors/MX-64.motor.yaml").motor
 XM430 = MotorModel(

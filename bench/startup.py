@@ -1,6 +1,6 @@
 """Start-up of the commands, as multiples of importing numpy, pydantic and PyYAML in the same minute.
 
-    python tests/bench/startup.py [--rounds 9] [--no-bytecode]
+    python bench/startup.py [--rounds 9] [--no-bytecode]
 
 The commands alternate with the import, so that a busy machine slows both alike; only the ratio of the medians
 counts. Bytecode is cached, as an installed package has it; `--no-bytecode` measures a checkout that compiles
@@ -18,7 +18,7 @@ import tempfile
 import time
 from pathlib import Path
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[1]
 ROBOT = "robots/bioloid_torso.yaml"
 START = "import sys; from dxlrun.cli import main; sys.exit(main())"
 IMPORT = "numpy, pydantic, yaml"

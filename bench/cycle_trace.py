@@ -8,7 +8,7 @@ functions of numpy and of the standard library are not counted.
 With --command the torso (robots/bioloid_torso.yaml) gets positions and speeds of its head through the mailbox
 in every fifth cycle, and the most frequent one that takes them is printed.
 
-    python tests/bench/cycle_trace.py [ROBOT.yaml | --command]
+    python bench/cycle_trace.py [ROBOT.yaml | --command]
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from dxlwire.clock import MonotonicClock
 from dxlwire.port.ports import SerialPort, SerialPorts
 from exchange.simulated import SimulatedServos
 
-ROBOTS = Path(__file__).parents[2] / "robots"
+ROBOTS = Path(__file__).parents[1] / "robots"
 ROBOT = ROBOTS / "open_manipulator_x.yaml"
 COMMANDED = ROBOTS / "bioloid_torso.yaml"
 COMMAND_CYCLES = 5

@@ -1,7 +1,7 @@
 """Log size: where the bytes of a log are, a cycle; also what each topic takes when it is compressed alone.
 
 dxlrun robots/bioloid_torso.yaml --virtual --play robots/motions/three_parts.yaml
-python tests/bench/log_size.py logs/*.mcap
+python bench/log_size.py logs/*.mcap
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """What a JointController takes in a cycle beside the same law of a Controller with `out=` in every step.
 
-    python tests/bench/short_law.py [--updates 20000]
+    python bench/short_law.py [--updates 20000]
 
 Prints the best of seven rounds, us of update() alone, of a sine of positions and of a spring of efforts.
 """
@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parents[2]))
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from tests.kit.stages import Stage
 

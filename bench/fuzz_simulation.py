@@ -5,7 +5,7 @@ intact packet is in the bytes since the last pause, there is no reply at all; me
 and after each servo's share, set back to how it was, it still answers a ping. Packets and checksums are made
 and judged by code of this file.
 
-    python tests/bench/fuzz_simulation.py 1000000
+    python bench/fuzz_simulation.py 1000000
 
 CI runs a seeded sample of it (tests/dxlsim/test_fuzz.py).
 """

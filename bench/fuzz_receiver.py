@@ -5,7 +5,7 @@ with flushes in between as after a timeout; now and then it has the replies to a
 at all. Nothing may be raised, the receiver keeps no more than its one buffer, each byte leaves it once
 and in order, and every intact packet is delivered exactly once.
 
-    python tests/bench/fuzz_receiver.py 1000000
+    python bench/fuzz_receiver.py 1000000
 
 CI runs a seeded sample of it (tests/dxlwire/test_receiver.py).
 """

@@ -22,7 +22,7 @@ _MOST_SERVOS = 50
 def parser() -> argparse.ArgumentParser:
     """Return what understands the command line."""
     made = argparse.ArgumentParser(
-        prog="tests/bench/exchange",
+        prog="bench/exchange",
         description="Measure one read and write of all servos: ours, dynamixel-sdk's and rustypot's, side by "
         "side. All read and write the same registers of the same servos, in turns, each on the same core.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
@@ -60,7 +60,7 @@ def main(words: Sequence[str] | None = None) -> int:
         return _measure(parser().parse_args(words))
     except DxlrunError as error:
         for sentence in str(error).splitlines():
-            print_error(f"tests/bench/exchange: {sentence}")
+            print_error(f"bench/exchange: {sentence}")
         return error.exit_code
     except KeyboardInterrupt:
         print_error("interrupted")

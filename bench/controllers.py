@@ -1,6 +1,6 @@
 """How long update() of each standard controller takes with 20 joints, in motion.
 
-    python tests/bench/controllers.py [--updates 5000] [--joints 20]
+    python bench/controllers.py [--updates 5000] [--joints 20]
 
 Prints the median and the 99th percentile in us: of update() alone, without gathering and gate, with states
 that change each time. Processor time: on a busy machine the percentile of the time that passes is that of the
@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parents[2]))
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from tests.kit.laws import Case, cases
 

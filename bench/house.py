@@ -1,6 +1,6 @@
 """House: the reach of features, the imports of packages from inside the core, and the size of each room.
 
-    python tests/bench/house.py [COMMIT] [--names]
+    python bench/house.py [COMMIT] [--names]
 
 Measures a commit, or the working tree without one (its feature commits are those of HEAD). Every commit is
 measured by the same rules, so that two of them can be compared. `--names` also lists what was counted: the
@@ -41,7 +41,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[1]
 CODE = (".py", ".pyi", ".c", ".h")
 LAST = 40
 MOST_PARAMETERS = 8
@@ -108,10 +108,11 @@ def git(*words: str) -> bytes:
 
 def read_sources(commit: str) -> dict[str, str]:
     """Return the text of each source file of a commit, or of the working tree, by its path."""
-    folders = ("runtime", "plugins", "tests")
+    folders = ("runtime", "plugins", "tests", "bench")
     if not commit:
         files = (path for folder in folders for path in sorted((ROOT / folder).rglob("*")))
         return {f"{path.relative_to(ROOT)}": path.read_text() for path in files if path.name.endswith(CODE)}
+    folders = tuple(git("ls-tree", "--name-only", commit, *folders).decode().split())  # it may have fewer
     with tarfile.open(fileobj=io.BytesIO(git("archive", commit, *folders))) as tar:
         members = {member.name: tar.extractfile(member) for member in tar if member.name.endswith(CODE)}
         return {path: file.read().decode() for path, file in members.items() if file is not None}

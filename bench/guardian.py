@@ -1,6 +1,6 @@
 """How soon the guardian acts: kills or stops the loop of a simulated torso again and again, and measures.
 
-    python tests/bench/guardian.py [--runs 10] [--signal KILL|STOP]
+    python bench/guardian.py [--runs 10] [--signal KILL|STOP]
 
 Judged by the simulated bus' ledger: the time from the loop's last byte to the first byte of the broadcast
 torque-off. The bound is 100 ms after the end of a loop, 5 periods + 100 ms (200 ms at 50 Hz) when it hangs.
@@ -22,7 +22,7 @@ from pathlib import Path
 from dxlsim.bus.ledger import read_ledger
 
 DXLRUN = Path(sys.executable).with_name("dxlrun")
-TORSO = Path(__file__).parents[2] / "robots/bioloid_torso.yaml"
+TORSO = Path(__file__).parents[1] / "robots/bioloid_torso.yaml"
 LIMP = bytes.fromhex("fffffe04031800")  # broadcast: write 0 to torque enable (24)
 
 

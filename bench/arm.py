@@ -1,8 +1,8 @@
 """dxlrun on ARM: the wheel for aarch64 in a Debian arm64 root under qemu-user, beside this machine.
 
     sudo apt install qemu-user-static debootstrap && .venv/bin/pip install '.[release]'
-    sudo .venv/bin/python tests/bench/arm.py /tmp/arm64 --qemu /usr/bin/qemu-aarch64
-    sudo .venv/bin/python tests/bench/arm.py /tmp/arm64 fuzz --streams 2000
+    sudo .venv/bin/python bench/arm.py /tmp/arm64 --qemu /usr/bin/qemu-aarch64
+    sudo .venv/bin/python bench/arm.py /tmp/arm64 fuzz --streams 2000
 
 Makes the root, installs this commit with the versions of the packages that it has here, and runs there the
 README's first command on virtual time, tests, and that command in all processes. The kernel's fuzz and the
@@ -25,11 +25,11 @@ import tempfile
 import time
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parents[2]))
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from tests.kit.loaded import loaded
 
-HERE = Path(__file__).parents[2]
+HERE = Path(__file__).parents[1]
 build = loaded(HERE / "release/build.py").build
 
 PLATFORMS = ("manylinux_2_17_aarch64", "manylinux2014_aarch64", "manylinux_2_28_aarch64")
@@ -117,7 +117,7 @@ class Arm:
 
     def fuzz(self) -> str:
         """Compare what the kernel's fuzz shows, robot by robot."""
-        line = f"tests/bench/fuzz_kernel.py {self.streams} --digests"
+        line = f"bench/fuzz_kernel.py {self.streams} --digests"
         both = run(sys.executable, *line.split()), self.inside(f"python {line}")
         here, there = ([one for one in text.splitlines() if one[0].isdigit()] for text in both)
         if here != there:
@@ -126,7 +126,7 @@ class Arm:
 
     def same(self) -> str:
         """Compare the hashes of whole runs on virtual time."""
-        program, numbers = "tests/bench/same_runs.py", [str(number) for number in range(self.runs)]
+        program, numbers = "bench/same_runs.py", [str(number) for number in range(self.runs)]
         with tempfile.TemporaryDirectory() as folder:
             here = Path(folder, "here.json")
             run(sys.executable, program, HERE, here, *numbers)

@@ -1,6 +1,6 @@
 """What one exchange with the servos costs, ours beside dynamixel-sdk's and rustypot's; see bench.md.
 
-python tests/bench/exchange [--servos 1,8,20] [--protocol 1.0,2.0] [--against canned,simulated] [--json]
+python bench/exchange [--servos 1,8,20] [--protocol 1.0,2.0] [--against canned,simulated] [--json]
 """
 
 import sys

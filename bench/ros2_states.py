@@ -4,7 +4,7 @@ A robot of `robots/` in real time, with its bridge; a foreign program listens by
 one by a best-effort subscription. The age of a message is from its stamp to its arrival in that program; what
 the robot's log has between the first and the last message, and the program did not get, is lost.
 
-    DXLRUN_ROS2_PYTHON=PYTHON python tests/bench/ros2_states.py [--seconds 30]
+    DXLRUN_ROS2_PYTHON=PYTHON python bench/ros2_states.py [--seconds 30]
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import tempfile
 import time
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parents[2]))
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import numpy as np
 from mcap.reader import make_reader

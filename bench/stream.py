@@ -5,7 +5,7 @@ a listener, then with one that takes every message of a topic. The age of a mess
 cycle to its arrival in this process; a cycle's time is that from its wake-up until its goals were sent, as
 the log has it.
 
-    python tests/bench/stream.py [--seconds 60] [--topic /joint_states]
+    python bench/stream.py [--seconds 60] [--topic /joint_states]
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import numpy as np
 import dxlrun
 from dxlrun.log.log_reader import read_log
 
-ROBOT = Path(__file__).parents[2] / "robots" / "humanoid_20.yaml"
+ROBOT = Path(__file__).parents[1] / "robots" / "humanoid_20.yaml"
 BEFORE_S = 3.0
 """What the robot needs to stand at 1 kHz."""
 

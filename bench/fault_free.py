@@ -1,6 +1,6 @@
 """Runs without a fault on simulated buses in real time while the machine is busy: is anything accused?
 
-    python -m tests.bench.fault_free [--runs 60] [--seconds 5]
+    python -m bench.fault_free [--runs 60] [--seconds 5]
 
 Three robots take turns, and so do four loads: none, a compile job in a loop, a program that keeps the core of
 the loop busy, and both. Prints the verdict on each run, and a table; ends with 1 if a servo, a cable or an

@@ -4,7 +4,7 @@ The client sends to a socket that answers at once; the gateway gets the same req
 loop that takes it from its mailbox. What a first command imports and looks up is not counted. `ours` are the
 functions of dxlrun; the others are of the standard library and of what it is built on.
 
-    PYTHONPATH=. python tests/bench/send_trace.py
+    PYTHONPATH=. python bench/send_trace.py
 """
 
 from __future__ import annotations

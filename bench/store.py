@@ -4,7 +4,7 @@ Logs of virtual runs of 2 to 3 s are copied by `dxlrun upload` to a directory by
 and to a server of S3 (moto, on this machine), and asked twice by `dxlrun logs`: the second time the table is
 kept. Needs `pip install 'moto[server,s3]'`.
 
-    python tests/bench/store.py [--logs 100]
+    python bench/store.py [--logs 100]
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from tests.kit.answers import result_of
 
 from dxlrun.testing import simulated_robot
 
-ROBOT = Path(__file__).parents[2] / "robots" / "single_joint.yaml"
+ROBOT = Path(__file__).parents[1] / "robots" / "single_joint.yaml"
 DXLRUN = Path(sys.executable).with_name("dxlrun")
 QUESTION = ("--where", "cycles > 800", "--sort", "cycles DESC")
 
