@@ -13,29 +13,22 @@ in their place, and the result:
 
 The lines to replace occur once in the file; a fault whose lines are gone cannot be tried any more. The fault
 is applied to this checkout, which must be clean and installed with `pip install -e`, and is taken back at the
-end. The short tests of its room run, those first that name its module; with `--deep` then the whole suite.
-What takes longer than the limit has not found the fault: a test that nobody waits for finds nothing.
+end. Its tests are the short ones of its room, and those that name its module (tests/faults/trials.py).
 """
 
 from __future__ import annotations
 
 import argparse
-import re
 import signal
-import subprocess
 import sys
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
 ROOT = Path(__file__).parents[2]
-sys.path.insert(0, str(ROOT))  # as a program, its own folder is the first
-
-from tests.kit import selection  # noqa: E402  in the repository, not in the folder of this program
-
 FOLDER = Path(__file__).parent
-LIMIT_S = 240.0
 
 
 class Fault(NamedTuple):
@@ -77,84 +70,40 @@ def problems(fault: Fault) -> Iterator[str]:
         yield f"{fault.path}: {fault.effect!r} changes nothing"
 
 
-def tests_of(path: str) -> list[str]:
-    """Return the short test files of the room of a product file, those first that name its module."""
-    module = selection.module_of(path)
-    long = {name for name, _ in selection.long_files()}
-    folders = selection.tests_of(selection.room_of(module))
-    files = [file for folder in folders for file in sorted((ROOT / "tests" / folder).rglob("test_*.py"))]
-    parent, _, name = module.rpartition(".")
-    names = re.compile(rf"\b({re.escape(module)}|from {re.escape(parent)} import .*\b{re.escape(name)})\b")
-    files.sort(key=lambda file: names.search(file.read_text("utf-8")) is None)
-    return [path for file in files if (path := str(file.relative_to(ROOT))) not in long]
+def texts_of(fault: Fault) -> tuple[str, str]:
+    """Return the file of a fault, without and with it."""
+    right = (ROOT / fault.path).read_text("utf-8")
+    return right, right.replace(f"{fault.old}\n", f"{fault.new}\n" if fault.new else "", 1)
 
 
-def run_tests(words: Sequence[str]) -> str:
-    """Return the first test that fails; empty if none does within the limit."""
-    command = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "-q",
-        "-x",
-        "-n",
-        "0",
-        "-p",
-        "no:cacheprovider",
-        "--timeout=120",
-    ]
-    with subprocess.Popen(
-        [*command, *words], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
-    ) as ran:
-        try:
-            output, _ = ran.communicate(timeout=LIMIT_S)
-        except subprocess.TimeoutExpired:
-            ran.send_signal(signal.SIGINT)  # lets the tests end what they started
-            ran.communicate()
-            return ""
-    failed = re.search(r"^(?:FAILED|ERROR) (\S+)", output, re.MULTILINE)
-    return failed[1] if failed else "" if ran.returncode == 0 else "tests end with an error"
-
-
-def build() -> None:
-    """Compile the C sources again."""
-    command = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "-e", "."]
-    subprocess.run(command, cwd=ROOT, check=True)
-
-
-def tried(fault: Fault, *, deep: bool) -> Fault:
-    """Apply a fault, run the tests, and take it back."""
+@contextmanager
+def applied(fault: Fault) -> Iterator[None]:
+    """Apply a fault to this checkout, and take it back at the end."""
     path = ROOT / fault.path
-    before = path.read_text("utf-8")
-    path.write_text(before.replace(f"{fault.old}\n", f"{fault.new}\n" if fault.new else "", 1), "utf-8")
+    right, wrong = texts_of(fault)
+    path.write_text(wrong, "utf-8")
     try:
-        if path.suffix == ".c":
-            build()
-        found = run_tests(tests_of(fault.path)) or (run_tests(()) if deep else "")
+        yield
     finally:
-        path.write_text(before, "utf-8")
-        if path.suffix == ".c":
-            build()
-    return fault._replace(result=f"found by: {found}" if found else "not found")
+        path.write_text(right, "utf-8")
 
 
 def main() -> None:
     """Print the table, or try what has no result yet."""
+    sys.path[0] = str(ROOT)  # as a program, its own folder is the first
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--try", dest="files", nargs="+", default=(), metavar="FILE", help="files to try")
-    parser.add_argument(
-        "--deep", action="store_true", help="run all short tests where those of the room pass"
-    )
     options = parser.parse_args()
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # takes the fault back, as Ctrl-C does
     for name in options.files:
+        from tests.faults.trials import tried
+
         path = FOLDER / name
         faults = [*parsed(path.read_text("utf-8"))]
-        for index, fault in enumerate(faults):
-            if not fault.result and not [*problems(fault)]:
-                faults[index] = tried(fault, deep=options.deep)
-                print(f"{fault.path}: {fault.effect}: {faults[index].result}", flush=True)
-                path.write_text("\n\n".join(one.text() for one in faults) + "\n", "utf-8")
+        for result in tried([one for one in faults if not one.result and not [*problems(one)]]):
+            faults = [result if one == result._replace(result="") else one for one in faults]
+            print(f"{result.path}: {result.effect}: {result.result}", flush=True)
+            path.write_text("\n\n".join(one.text() for one in faults) + "\n", "utf-8")
     for path in sorted(FOLDER.glob("*.txt")):
         tally = Counter(
             one.result.partition(":")[0] or "not tried" for one in parsed(path.read_text("utf-8"))

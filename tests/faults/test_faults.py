@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import pytest
-from tests.faults import faults
+from tests.faults import faults, trials
+from tests.faults.faults import Fault
+from tests.kit.loaded import loaded
 
 BLOCK = """runtime/dxlrun/errors.py: nothing is missing
 -     if not missing:
@@ -53,32 +56,98 @@ def test_fault_that_cannot_be_applied_is_named(change: dict[str, str], problem: 
     ],
 )
 def test_room_has_its_tests(path: str, first: str) -> None:
-    assert faults.tests_of(path)[0].startswith(first)
+    assert trials.tests_of(path)[0].startswith(first)
 
 
-@pytest.mark.parametrize("ends", ["", "tests/x.py::test_it", "interrupt"])
-def test_fault_is_taken_back_however_its_tests_end(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ends: str
-) -> None:
+def test_tests_elsewhere_that_name_the_module_belong_to_a_fault() -> None:
+    files = trials.tests_of("runtime/dxlrun/control/loop.py")
+    assert "tests/control/test_loop.py" in files
+    assert any(not file.startswith(("tests/control/", "tests/run/")) for file in files)
+    assert len(files) == len(set(files))
+
+
+def test_fault_is_taken_back_however_its_tests_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(faults, "ROOT", tmp_path)
     product = tmp_path / "product.py"
     product.write_text("a = 1\nb = 2\n")
-    seen: list[str] = []
+    fault = Fault("product.py", "b is wrong", "b = 2", "b = 3", "")
 
-    def tests(_: object) -> str:
-        seen.append(product.read_text())
-        if ends == "interrupt":
+    def interrupted() -> None:
+        with faults.applied(fault):
+            assert product.read_text() == "a = 1\nb = 3\n"
             raise KeyboardInterrupt
-        return ends
 
-    monkeypatch.setattr(faults, "run_tests", tests)
-    monkeypatch.setattr(faults, "tests_of", lambda _: [])
-    fault = faults.Fault("product.py", "b is wrong", "b = 2", "b = 3", "")
-    if ends == "interrupt":
-        with pytest.raises(KeyboardInterrupt):
-            faults.tried(fault, deep=False)
-    else:
-        result = faults.tried(fault, deep=False).result
-        assert result == (f"found by: {ends}" if ends else "not found")
-    assert seen == ["a = 1\nb = 3\n"]
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
     assert product.read_text() == "a = 1\nb = 2\n"
+
+
+PRODUCT = """class Joint:
+    def __init__(self):
+        self.angle = 1
+
+    @property
+    def goal(self):
+        return self.angle
+
+    @goal.setter
+    def goal(self, goal):
+        self.angle = goal
+
+def counter():
+    number = 0
+    def count():
+        nonlocal number
+        number += 1
+        return number
+    return count
+"""
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "goals", "counts"),
+    [
+        ("self.angle = goal", "self.angle = -goal", (1, -5), (1, 2)),
+        ("return self.angle", "return 2 * self.angle", (2, 10), (1, 2)),
+        ("number += 1", "number += 3", (1, 5), (1, 4)),  # what counted before goes on with its own number
+    ],
+)
+def test_functions_that_are_in_use_get_the_fault(
+    tmp_path: Path, old: str, new: str, goals: tuple[int, int], counts: tuple[int, int]
+) -> None:
+    path = tmp_path / "product.py"
+    path.write_text(PRODUCT)
+    product = loaded(path)
+    joint, count = product.Joint(), product.counter()
+    seen = [count()]
+    assert trials.load(path, PRODUCT, PRODUCT.replace(old, new))
+    before, joint.goal = joint.goal, 5
+    assert (before, joint.goal) == goals
+    assert (*seen, count()) == counts
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "can"),
+    [
+        ("number = 0", "number = 1", True),
+        ("class Joint:", "class Joint(Exception):", False),
+        ("def goal(self, goal):", "def goal(self, goal=0):", False),
+    ],
+)
+def test_fault_outside_of_functions_needs_a_pytest_of_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, old: str, new: str, can: bool
+) -> None:
+    monkeypatch.setattr(faults, "ROOT", tmp_path)
+    (tmp_path / "product.py").write_text(PRODUCT)
+    lines = next(line for line in PRODUCT.splitlines() if old in line)
+    fault = Fault("product.py", "wrong", lines, lines.replace(old, new), "")
+    assert trials.is_loadable(fault) is can
+
+
+def test_what_takes_too_long_finds_nothing() -> None:
+    def last_word() -> list[str]:
+        time.sleep(60.0)
+        return ["late"]
+
+    assert trials.in_copy(lambda: ["tests/x.py::test_it"]) == ["tests/x.py::test_it"]
+    assert trials.in_copy(last_word, limit_s=0.2) == []
