@@ -1,29 +1,46 @@
 # ruff: noqa: E501 (a mistake and its sentence are read best side by side)
-"""Limits of joints by unlike bounds: each side, each sign, and what lies on the bound itself."""
+"""Limits of joints, for motions, commands and clients: each side, each sign, and the bound itself."""
 
 from __future__ import annotations
 
+import json
 import math
 
+import numpy as np
 import pytest
+from tests.kit.robots import compile_text, robot_text
 
-from dxlrun.compile.joints.limits import (
-    Interval,
-    beyond_limits,
-    check_samples,
-    limits_of,
-)
+from dxlrun.compile.joints.limits import Interval, beyond_limits, check_samples, degrees, limits_of
 from dxlrun.compile.motion_samples import MotionSample, SampledTarget
 from dxlrun.compile.problems import Problems
-from dxlrun.contract.controller import SpeedPeak
+from dxlrun.contract.controller import CommandModel, SpeedPeak
+from dxlrun.control.controllers.plugin_loading import load_plugins
 from dxlrun.errors import Mark
 from dxlrun.plan.loop_plan import JointPlan
-from dxlrun_controllers.group import EffortsCommand, PositionsCommand, VelocitiesCommand
+from dxlrun.remote.preparation import Preparation, RefusedRequest
+from dxlrun_controllers.group import (
+    EffortsCommand,
+    PosEffortCommand,
+    PositionsCommand,
+    PosVelCommand,
+    VelocitiesCommand,
+)
+from dxlrun_controllers.motions.trajectory_command import (
+    TrajectoryCommand,
+    flat_trajectory,
+    trajectory_speed_peaks,
+)
+from dxlwire.control_table import find_table
 from dxlwire.joint_unit import LINEAR
 
 MARK = Mark("m.yaml", 3, 5)
 ARM = JointPlan("arm", -1.0, 0.5, 2.0, 0.5, top_speed=8.0, top_effort=3.0)
 SLIDE = JointPlan("slide", -0.02, 0.05, None, top_speed=0.1, top_effort=3.0, unit=LINEAR)
+FREE = JointPlan("free", -2.0, 2.0, None, top_speed=8.0, top_effort=3.0)
+JOINTS = (FREE, ARM)
+RANGE = "outside its limits -57.3..+28.65 deg"
+FREE_SPEED = "more than 8 rad/s, the top speed of its servo"
+ARM_SPEED = "more than 2 rad/s, its velocity limit"
 SOME_S = 1_000_000_000
 
 
@@ -37,59 +54,55 @@ SOME_S = 1_000_000_000
         (0, 0, True),
     ],
 )
-def test_an_interval_contains_what_is_inside_on_both_sides(lower: float, upper: float, inside: bool) -> None:
+def test_interval_contains_what_is_inside_on_both_sides(lower: float, upper: float, inside: bool) -> None:
     assert limits_of(ARM).contains(Interval(lower, upper)) is inside
 
 
 def test_intervals_meet_in_the_tighter_bound_of_each_side() -> None:
-    for one, other in ((Interval(-3, 1), Interval(-2, 4)), (Interval(-2, 4), Interval(-3, 1))):
-        assert one.meet(other) == Interval(-2, 1)
+    assert Interval(-3, 1).meet(Interval(-2, 4)) == Interval(-2, 4).meet(Interval(-3, 1)) == Interval(-2, 1)
     assert Interval(-3, -1).meet(Interval(-1, 2)) is None  # a point
     assert Interval(-3, -2).meet(Interval(-1, 2)) is None
     assert Interval(-3, 1).scaled(2.0, LINEAR) == Interval(-6, 2, LINEAR)
     assert (limits_of(ARM), limits_of(SLIDE)) == (Interval(-1, 0.5), Interval(-0.02, 0.05, LINEAR))
 
 
-def test_positions_are_written_with_their_signs() -> None:
+def test_positions_are_written_with_their_signs_and_short() -> None:
     assert (str(limits_of(ARM)), str(limits_of(SLIDE))) == ("-57.3..+28.65 deg", "-20..+50 mm")
+    assert [degrees(value) for value in (math.radians(60), -1e-9, 1.77)] == ["60", "0", "101.41"]
 
 
 def samples(*rows: tuple[float, float | None, float | None]) -> list[MotionSample]:
-    """Return samples of `arm`: time s, position, velocity."""
+    """Return samples of `arm`: time s, position, velocity; in the lines 3, 4, ..."""
     return [
         MotionSample(
-            round(t * SOME_S),
-            {"arm": SampledTarget(position, velocity, None, Mark("m.yaml", 3 + index))},
-            MARK,
+            round(t * SOME_S), {"arm": SampledTarget(position, velocity, None, Mark("m.yaml", line))}, MARK
         )
-        for index, (t, position, velocity) in enumerate(rows)
+        for line, (t, position, velocity) in enumerate(rows, 3)
     ]
+
+
+def told_of(listed: list[MotionSample], *peaks: SpeedPeak) -> list[str]:
+    problems = Problems()
+    check_samples(listed, 2 * SOME_S, {"arm": ARM}, problems, peaks)
+    return [str(one).removeprefix("m.yaml:") for one in (*problems.errors, *problems.warnings)]
 
 
 @pytest.mark.parametrize(
     ("positions", "told"),
     [
-        ((-1.0, 0.5), None),
-        ((-1.0 - 5e-7, 0.5 + 5e-7), None),
-        ((0.0, -1.01), "arm is sent to -57.87 deg at 3.000 s, outside its limits -57.3..+28.65 deg"),
-        ((0.51, 0.0), "arm is sent to 29.22 deg at 2.000 s, outside its limits -57.3..+28.65 deg"),
-        (
-            (-1.1, 0.7),
-            "arm is sent to 40.11 deg at 3.000 s, outside its limits -57.3..+28.65 deg",
-        ),  # the worst
-        ((-1.3, 0.7), "arm is sent to -74.48 deg at 2.000 s, outside its limits -57.3..+28.65 deg"),
+        ((-1.0, 0.5), []),
+        ((-1.0 - 5e-7, 0.5 + 5e-7), []),
+        ((0.0, -1.01), ["4:1: warning: arm is sent to -57.87 deg at 3.000 s"]),
+        ((0.51, 0.0), ["3:1: warning: arm is sent to 29.22 deg at 2.000 s"]),
+        ((-1.1, 0.7), ["4:1: warning: arm is sent to 40.11 deg at 3.000 s"]),
+        ((-1.3, 0.7), ["3:1: warning: arm is sent to -74.48 deg at 2.000 s"]),
     ],
 )
-def test_the_worst_target_beyond_either_limit_is_told_once(
-    positions: tuple[float, ...], told: str | None
+def test_worst_target_beyond_either_limit_is_reported_once(
+    positions: tuple[float, ...], told: list[str]
 ) -> None:
-    problems = Problems()
-    listed = samples(*((index, position, None) for index, position in enumerate(positions)))
-    check_samples(listed, 2 * SOME_S, {"arm": ARM}, problems)
-    assert [one.what for one in problems.warnings] == ([told] if told else [])
-    if told:
-        worst = max(range(2), key=lambda index: max(-1.0 - positions[index], positions[index] - 0.5))
-        assert problems.warnings[0].mark.line == 3 + worst
+    found = told_of(samples(*((index, position, None) for index, position in enumerate(positions))))
+    assert [one.partition(f", {RANGE}")[0] for one in found] == told
 
 
 def peak(speed: float, time: float) -> SpeedPeak:
@@ -100,57 +113,134 @@ def peak(speed: float, time: float) -> SpeedPeak:
     ("rows", "peaks", "told"),
     [
         (((0, 0.0, 2.0), (1, 0.0, -2.0)), [peak(-2.0, 0.5)], []),
-        (((0, 0.0, -2.1),), [], ["warning: arm is commanded to 2.1 rad/s at 2.000 s, more than 2 rad/s, its velocity limit"]),
-        (((0, 0.0, 2.1), (1, 0.0, -7.9)), [], ["warning: arm is commanded to 7.9 rad/s at 3.000 s"]),
-        (((0, 0.0, -8.1),), [], ["arm is commanded to 8.1 rad/s at 2.000 s, more than 8 rad/s, the top speed of its servo"]),
+        (((0, 0.0, -2.1),), [], [f"3:1: warning: arm is commanded to 2.1 rad/s at 2.000 s, {ARM_SPEED}"]),
+        (((0, 0.0, 2.1), (1, 0.0, -7.9)), [], ["4:1: warning: arm is commanded to 7.9 rad/s at 3.000 s"]),
+        (((0, 0.0, -8.1),), [], [f"3:1: arm is commanded to 8.1 rad/s at 2.000 s, {FREE_SPEED}"]),
         (((0, -0.5, None), (0.25, 0.5, None)), [], []),  # nothing moves between the two
-        (((0, -0.5, None), (0.25, 0.5, None)), [peak(4.0, 0.25)], ["warning: arm is commanded to 4 rad/s at 2.250 s"]),
-        (((0, 0.5, 0.0), (0.25, -0.5, 0.0)), [peak(-6.0, 0.125)], ["warning: arm is commanded to 6 rad/s at 2.125 s"]),
-        (((0, 0.5, 0.0), (0.1, -0.5, 0.0)), [peak(-15.0, 0.05)], ["arm is commanded to 15 rad/s at 2.050 s"]),
-        (((0, 0.5, 3.0), (0.1, 0.5, 0.0)), [peak(-2.5, 0.05)], ["warning: arm is commanded to 3 rad/s at 2.000 s"]),
+        (((0, -0.5, None), (0.25, 0.5, None)), [peak(4.0, 0.25)], ["4:1: warning: arm is commanded to 4 rad/s at 2.250 s"]),
+        (((0, 0.5, 0.0), (0.25, -0.5, 0.0)), [peak(-6.0, 0.125)], ["4:1: warning: arm is commanded to 6 rad/s at 2.125 s"]),
+        (((0, 0.5, 0.0), (0.1, -0.5, 0.0)), [peak(-15.0, 0.05)], ["4:1: arm is commanded to 15 rad/s at 2.050 s"]),
+        (((0, 0.5, 3.0), (0.1, 0.5, 0.0)), [peak(-2.5, 0.05)], ["3:1: warning: arm is commanded to 3 rad/s at 2.000 s"]),
+        (((0, 0.0, 0.0), (1, 0.4, 0.0), (2, -0.4, 0.0)), [peak(-2.4, 1.5)], ["5:1: warning: arm is commanded to 2.4 rad/s at 3.500 s"]),
     ],
 )  # fmt: skip
 def test_speeds_of_either_sign_are_compared(
     rows: tuple[tuple[float, float | None, float | None], ...], peaks: list[SpeedPeak], told: list[str]
 ) -> None:
-    problems = Problems()
-    check_samples(samples(*rows), 2 * SOME_S, {"arm": ARM}, problems, peaks)
-    found = [str(one).split(": ", 1)[1] for one in (*problems.errors, *problems.warnings)]
-    assert len(found) == len(told)
-    assert all(one.startswith(start) for one, start in zip(found, told, strict=True)), found
+    found = told_of(samples(*rows), *peaks)
+    assert [one[: len(start)] for one, start in zip(found, told, strict=True)] == told
 
 
-def test_a_peak_is_reported_at_the_point_that_its_way_leads_to() -> None:
-    problems = Problems()
-    listed = samples((0, 0.0, 0.0), (1, 0.4, 0.0), (2, -0.4, 0.0))
-    check_samples(listed, 0, {"arm": ARM}, problems, [peak(-2.4, 1.5)])
-    (warning,) = problems.warnings
-    assert warning.mark.line == 5
-    assert "allow more time, 1.2 times as long, or raise the limit" in warning.fix
+def trajectory(*points: tuple[float, tuple[float, float]], **more: object) -> TrajectoryCommand:
+    return TrajectoryCommand.model_validate(
+        {"points": [{"time": time, "positions": positions} | more for time, positions in points]}
+    )
+
+
+def beyond(command: CommandModel) -> list[str]:
+    """Return what is said of a command for a controller of both joints; each names its joint first."""
+    names = tuple(joint.name for joint in JOINTS)
+    peaks: list[SpeedPeak] = []
+    if isinstance(command, TrajectoryCommand):
+        peaks = [*trajectory_speed_peaks("trajectory", flat_trajectory(command, names), names)]
+    found = beyond_limits(JOINTS, command, peaks)
+    assert all(one.text.startswith(f"{one.joint} is ") for one in found)
+    return [one.text for one in found]
 
 
 @pytest.mark.parametrize(
-    ("value", "beyond"),
-    [(-1.0, False), (0.5, False), (-1.01, True), (0.51, True), (-0.9, False), (0.6, True)],
-)
-def test_positions_of_commands_have_two_unlike_bounds(value: float, beyond: bool) -> None:
-    found = beyond_limits((ARM,), PositionsCommand(positions=(value,)))
-    assert [one.joint for one in found] == ["arm"] * beyond
-    assert (
-        not found or f"{math.degrees(value):.6g} deg, outside its limits -57.3..+28.65 deg" in found[0].text
-    )
+    ("command", "sentences"),
+    [
+        (PositionsCommand(positions=(2.0, -1.0)), []),
+        (PositionsCommand(positions=(-2.0, 0.5)), []),
+        (
+            PositionsCommand(positions=(math.radians(9999), -1.01)),
+            ["free is sent to 9999 deg, outside its limits -114.59..+114.59 deg", f"arm is sent to -57.8687 deg, {RANGE}"],
+        ),
+        (PositionsCommand(positions=(-2.01, 0.51)), ["free is sent to -115.165 deg, outside its limits -114.59..+114.59 deg", f"arm is sent to 29.2208 deg, {RANGE}"]),
+        (PositionsCommand(positions=(9.0,)), []),  # a wrong size is for `prepare`
+        (PosVelCommand(positions=(0.0, 0.0), velocities=(-8.0, -2.0)), []),
+        (
+            PosVelCommand(positions=(0.0, 0.0), velocities=(1e300, 2.1)),
+            [f"free is commanded to 1e+300 rad/s, {FREE_SPEED}", f"arm is commanded to 2.1 rad/s, {ARM_SPEED}"],
+        ),
+        (VelocitiesCommand(velocities=(-9.0, -2.001)), [f"free is commanded to -9 rad/s, {FREE_SPEED}", f"arm is commanded to -2.001 rad/s, {ARM_SPEED}"]),
+        (PosEffortCommand(positions=(0.0, 0.0), efforts=(3.0, -0.5)), []),
+        (
+            EffortsCommand(efforts=(1e9, -0.6)),
+            ["free is commanded to 1e+09, more than 3, the highest goal of its servo", "arm is commanded to -0.6, more than 0.5, its effort limit"],
+        ),
+        (trajectory((0.0, (2.0, 0.5))), []),  # the first point may be at once
+        (trajectory((0.0, (0.0, 0.0)), (0.25, (2.0, 0.5)), (0.5, (0.0, 0.0))), []),
+        (
+            trajectory((0.0, (0.0, 0.0)), (0.2, (2.0, 0.4)), (0.3, (2.0, 0.1))),
+            [
+                f"free is commanded to 10 rad/s at 0.200 s, from point 1 to 2, {FREE_SPEED}: allow more time, 1.25 times as long",
+                f"arm is commanded to -3 rad/s at 0.300 s, from point 2 to 3, {ARM_SPEED}: allow more time, 1.5 times as long",
+            ],
+        ),
+        (
+            trajectory((0.0, (0.0, 0.4)), (1.0, (0.0, -1.0)), velocities=(0.0, 0.0)),
+            [f"arm is commanded to -2.1 rad/s at 0.500 s, from point 1 to 2, {ARM_SPEED}: allow more time, 1.05 times as long"],
+        ),
+        (
+            TrajectoryCommand.model_validate({"joints": ["arm"], "points": [{"time": 1, "positions": [1.5]}]}),
+            [f"arm is sent to 85.9437 deg in point 1, {RANGE}"],
+        ),
+        (
+            trajectory((1.0, (0.0, 5.0)), velocities=(0.0, 3.0)),
+            [f"arm is sent to 286.479 deg in point 1, {RANGE}", f"arm is commanded to 3 rad/s in point 1, {ARM_SPEED}"],
+        ),
+    ],
+)  # fmt: skip
+def test_each_value_beyond_a_limit_is_named_with_its_joint_and_the_limit(
+    command: CommandModel, sentences: list[str]
+) -> None:
+    assert beyond(command) == sentences
 
 
-@pytest.mark.parametrize("sign", [-1, 1])
-def test_speeds_and_efforts_of_commands_have_a_magnitude(sign: int) -> None:
-    assert beyond_limits((ARM,), VelocitiesCommand(velocities=(sign * 2.0,))) == []
-    assert beyond_limits((ARM,), EffortsCommand(efforts=(sign * 0.5,))) == []
-    (speed,) = beyond_limits((ARM,), VelocitiesCommand(velocities=(sign * 2.001,)))
-    (effort,) = beyond_limits((ARM,), EffortsCommand(efforts=(sign * 0.501,)))
-    assert speed.text == f"arm is commanded to {sign * 2.001:g} rad/s, more than 2 rad/s, its velocity limit"
-    assert effort.text == f"arm is commanded to {sign * 0.501:g}, more than 0.5, its effort limit"
-    (slow,) = beyond_limits((SLIDE,), VelocitiesCommand(velocities=(sign * 0.11,)))
-    assert (
-        slow.text
-        == f"slide is commanded to {sign * 0.11:g} m/s, more than 0.1 m/s, the top speed of its servo"
-    )
+def test_limits_that_are_not_known_and_fields_that_are_no_numbers_of_joints_are_left_out() -> None:
+    class Odd(CommandModel):
+        positions: dict[str, float]
+        velocities: str
+        points: tuple[int, ...]
+
+    wheel = JointPlan("wheel", -math.inf, math.inf, None)
+    assert beyond_limits((wheel,), PosVelCommand(positions=(1e9,), velocities=(1e300,))) == []
+    assert beyond_limits(JOINTS, Odd(positions={"free": 9.0}, velocities="ab", points=(1, 2))) == []
+    (slow,) = beyond_limits((SLIDE,), VelocitiesCommand(velocities=(-0.11,)))
+    assert slow.text == "slide is commanded to -0.11 m/s, more than 0.1 m/s, the top speed of its servo"
+
+
+@pytest.mark.parametrize(("model", "protocol", "rpm"), [("XM430-W350", 2.0, 57.0), ("AX-12A", 1.0, 59.0)])
+def test_top_speed_of_a_servo_is_not_below_what_its_manual_gives(
+    model: str, protocol: float, rpm: float
+) -> None:
+    assert rpm <= find_table(model, protocol).top_speed * 30 / np.pi < 1.4 * rpm
+
+
+@pytest.mark.parametrize(
+    ("controller", "kind", "slow", "fast", "place"),
+    [
+        ("arm", "trajectory", {"points": [(1.0, 0.0), (2.21, 0.8)]}, {"points": [(1.0, 0.0), (2.0, 0.8)]}, "from point 1 to 2"),
+        ("poses", "play", {"motion": "there"}, {"motion": "there", "speed": 2.0}, "on the way to step 2 of there"),
+    ],
+)  # fmt: skip
+def test_command_of_a_client_is_refused_for_its_peak(
+    controller: str, kind: str, slow: dict[str, object], fast: dict[str, object], place: str
+) -> None:
+    loop = compile_text(robot_text("peaks")).plan.loop
+    preparation = Preparation({joint.name: joint for joint in loop.joints}, load_plugins())
+    plan = next(one for one in loop.controllers if one.name == controller)
+
+    def send(fields: dict[str, object]) -> None:
+        if "points" in fields:
+            points = [{"time": time, "positions": [at], "velocities": [0.0]} for time, at in fields["points"]]  # type: ignore[attr-defined]  # a row above
+            fields = {"points": points}
+        preparation.command(plan, kind, json.dumps(fields).encode()).require_within_limits()
+
+    send(slow)
+    with pytest.raises(RefusedRequest) as refused:
+        send(fast)
+    said = f"elbow is commanded to 1.2 rad/s at 1.500 s, {place}, more than 1 rad/s, its velocity limit"
+    assert f"{said}: allow more time, 1.2 times as long" in str(refused.value)

@@ -1,3 +1,5 @@
+"""Controllers of other packages: what the compiler makes of them, and of what they refuse or raise."""
+
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +13,6 @@ from tests.kit.stories import plugin_folder
 
 from dxlrun import CommandModel, Controller, Interfaces, ParametersModel
 from dxlrun.compile import robot_compiler
-from dxlrun.compile.robot_compiler import compile_files
 from dxlrun.control.controllers.plugin_loading import Offer, PlugIns, load_plugins
 from dxlrun.remote.preparation import Preparation, RefusedRequest
 
@@ -61,26 +62,66 @@ class Sleepy(Foreign):
 
 
 @pytest.fixture
-def foreign_plugins(monkeypatch: pytest.MonkeyPatch):
+def foreign_plugins(monkeypatch: pytest.MonkeyPatch) -> None:
     offers = dict(load_plugins().controllers)
-    offers["foreign"] = Offer("foreign", Foreign, "elsewhere 2.1")
-    offers["publishing"] = Offer("publishing", Publishing, "elsewhere 2.1")
-    offers["raising"] = Offer("raising", Raising, "elsewhere 2.1")
-    offers["sleepy"] = Offer("sleepy", Sleepy, "elsewhere 2.1")
+    for kind in (Foreign, Publishing, Raising, Sleepy):
+        name = kind.__name__.lower()
+        offers[name] = Offer(name, kind, "elsewhere 2.1")
     plugins = PlugIns(offers, {"sad": "plug-in sad of sad-robots 0.3 cannot be imported; reinstall it"})
     monkeypatch.setattr(robot_compiler, "load_plugins", lambda **_: plugins)
 
 
 FOREIGN = PAIR.partition("controllers:")[0] + "controllers:\n  mine: {type: foreign}\n"
+MOTION = """\
+name: m
+motions:
+  - controller: mine
+    points: [{time: 0 s, joints: {left_arm_joint: {position: 1 rad}, right_arm_joint: {position: 0 rad}}}]
+"""
 
 
 @pytest.mark.usefixtures("foreign_plugins")
-def test_its_topics_are_in_the_plan_and_none_is_that_of_a_bus():
-    text = FOREIGN.replace("foreign", "publishing")
-    (controller,) = compile_text(text).plan.loop.controllers
-    assert controller.topics == ("/mine/main",)
-    (problem,) = problems_in(text.replace("mine:", "bus:"))
-    assert (problem.what, problem.fix) == ("/bus/main is the topic of a bus", "rename controller bus")
+@pytest.mark.parametrize(
+    ("kind", "position", "place", "said"),
+    [
+        ("foreign", "1.04 rad", "motion0.yaml:4:14: ", "mine refuses this: more than one is too much"),
+        (
+            "foreign",
+            "-3 rad",
+            "motion0.yaml:4:14: ",
+            "mine refuses this: goals.positions[0] is -3.0, but must be at least -2; correct it",
+        ),
+        (
+            "raising",
+            "",
+            "robot.yaml:20:3: ",
+            "controller mine (elsewhere 2.1) cannot name its interfaces: RuntimeError: not today",
+        ),
+        (
+            "sleepy",
+            "",
+            "warning: ",
+            "the speeds of its motions cannot be checked: RuntimeError: not today",
+        ),
+        ("sad", "", "", "plug-in sad of sad-robots 0.3 cannot be imported; reinstall it"),
+    ],
+)
+def test_what_a_controller_refuses_or_raises_is_a_problem(
+    kind: str, position: str, place: str, said: str
+) -> None:
+    motions = [MOTION.replace("1 rad", position)] if position else []
+    (problem,) = problems_in(FOREIGN.replace("foreign", kind), *motions)
+    assert place in str(problem)
+    assert said in f"{problem.what}; {problem.fix}"
+
+
+@pytest.mark.usefixtures("foreign_plugins")
+def test_controller_of_another_package_is_compiled_and_played():
+    plan = compile_text(FOREIGN, MOTION).plan.loop
+    (controller,) = plan.controllers
+    assert (controller.distribution, controller.command) == ("elsewhere 2.1", ("position",))
+    assert controller.joints == ("left_arm_joint", "right_arm_joint")
+    assert list(np.frombuffer(plan.commands[0].data)) == [1.0, 0.0]
 
 
 @pytest.mark.usefixtures("foreign_plugins")
@@ -137,76 +178,6 @@ def test_only_packages_that_run_in_the_robot_are_in_its_plan(
     assert used.packages == {**late, **standard, "used_plug_in": "used-robots"}
 
 
-@pytest.mark.needs("physics")
-def test_the_package_of_physics_runs_where_servos_are_simulated() -> None:
-    robot = Path(__file__).parents[2] / "robots" / "held_arm.yaml"
-    simulated = compile_files(robot, {}, []).plan.packages
-    assert simulated["dxlrun_mujoco"] == "dxlrun"
-    real = compile_files(robot, {"port": "/dev/ttyUSB0"}, []).plan.packages
-    assert set(simulated) - set(real) == {"dxlrun_mujoco"}
-
-
-MOTION = """\
-name: m
-motions:
-  - controller: mine
-    points: [{time: 0 s, joints: {left_arm_joint: {position: 1 rad}, right_arm_joint: {position: 0 rad}}}]
-"""
-
-
-@pytest.mark.usefixtures("foreign_plugins")
-def test_a_controller_of_another_package_is_compiled_and_played():
-    plan = compile_text(FOREIGN, MOTION).plan.loop
-
-    (controller,) = plan.controllers
-    assert (controller.distribution, controller.command) == ("elsewhere 2.1", ("position",))
-    assert controller.joints == ("left_arm_joint", "right_arm_joint")
-    assert list(np.frombuffer(plan.commands[0].data)) == [1.0, 0.0]
-
-
-@pytest.mark.usefixtures("foreign_plugins")
-def test_what_its_prepare_refuses_is_an_error_of_the_motion():
-    (problem,) = problems_in(FOREIGN, MOTION.replace("1 rad", "1.04 rad"))
-
-    assert problem.what == "mine refuses this: more than one is too much"
-    assert (problem.mark.line, problem.mark.column) == (4, 14)
-
-
-@pytest.mark.usefixtures("foreign_plugins")
-def test_what_its_model_refuses_is_said_in_our_words():
-    (problem,) = problems_in(FOREIGN, MOTION.replace("1 rad", "-3 rad"))
-
-    assert problem.what == (
-        "mine refuses this: goals.positions[0] is -3.0, but must be at least -2; correct it"
-    )
-
-
-@pytest.mark.usefixtures("foreign_plugins")
-def test_what_its_interfaces_raise_is_an_error_of_the_file():
-    (problem,) = problems_in(FOREIGN.replace("foreign", "raising"))
-
-    assert (
-        "controller mine (elsewhere 2.1) cannot name its interfaces: RuntimeError: not today" in problem.what
-    )
-    assert (problem.mark.line, problem.mark.column) == (20, 3)
-
-
-@pytest.mark.usefixtures("foreign_plugins")
-def test_what_its_motions_raise_is_a_warning_of_the_file():
-    plan = compile_text(FOREIGN.replace("foreign", "sleepy"))
-    (warning,) = plan.warnings
-    assert "controller mine (elsewhere 2.1): the speeds of its motions cannot be checked" in warning.what
-    assert "RuntimeError: not today" in warning.what
-
-
-@pytest.mark.usefixtures("foreign_plugins")
-def test_an_unknown_type_names_the_broken_plug_ins():
-    (problem,) = problems_in(FOREIGN.replace("foreign", "sad"))
-
-    assert problem.fix == "plug-in sad of sad-robots 0.3 cannot be imported; reinstall it"
-
-
-@pytest.mark.usefixtures("foreign_plugins")
 def test_parameters_travel_as_they_were_written():
     text = PAIR.replace("    active: false\n", "    active: false\n    tolerances: {goal: 5 deg}\n")
 

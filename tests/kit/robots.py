@@ -8,13 +8,19 @@ from textwrap import dedent
 from dxlrun.compile.robot_compiler import CompiledRobot, compile_files
 from dxlrun.errors import InputError, Problem
 
-MISTAKES = Path(__file__).parents[1] / "compile" / "mistakes"
-"""Robot files, and what is said of them when they are changed; see `mistakes.py`."""
+CASES = Path(__file__).parents[1] / "compile" / "cases"
+"""Robot files, and what is said of them when they are changed; see `robot_cases.py`."""
 
 
 def robot_text(name: str) -> str:
-    """Return the robot file of a text of mistakes."""
-    return (MISTAKES / f"{name}.txt").read_text("utf-8").partition("====\n")[0].partition("----\n")[0]
+    """Return the robot file of a text of cases."""
+    return whole_text((CASES / f"{name}.txt").read_text("utf-8").partition("====\n")[0]).partition("---- ")[0]
+
+
+def whole_text(head: str) -> str:
+    """Return the files at the head of a text of cases, with the robot file that `like NAME` stands for."""
+    first, _, more = head.partition("\n")
+    return robot_text(first.removeprefix("like ")) + more if first.startswith("like ") else head
 
 
 PAIR = robot_text("pair")
