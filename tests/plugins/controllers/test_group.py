@@ -5,10 +5,8 @@ import pytest
 from tests.kit.laws import cases
 from tests.kit.stages import Stage
 
-from dxlrun_controllers.group import JointGroupPosVelController
 from dxlrun_controllers.joint_state_broadcaster import JointStateBroadcaster
 
-TWO = {"joints": ["a", "b"]}
 GROUPS = [case for case in cases(("a", "b")) if case.type.startswith("joint_group_")]
 FIELDS = {"position": "positions", "velocity": "velocities", "effort": "efforts", "pwm": "pwm"}
 
@@ -31,26 +29,10 @@ def test_it_holds_or_gives_nothing_until_a_command_comes_and_forwards_it(case):
                 np.testing.assert_array_equal(getattr(robot.commands, name), expected)
 
 
-def test_a_velocity_beside_a_position_keeps_its_sign():
-    robot = Stage(JointGroupPosVelController, TWO).activate()
-    robot.send(0.0, "posvel", positions=[0.5, 0.6], velocities=[1.0, -2.0])
-    np.testing.assert_array_equal(robot.commands.velocity, [1.0, -2.0])
-
-
 def test_the_broadcaster_publishes_each_update():
-    robot = Stage(JointStateBroadcaster, {})
+    robot = Stage(JointStateBroadcaster, {}).activate()
     assert JointStateBroadcaster.publishes == ("/joint_states",)
-    robot.activate()
     for time in range(3):
         robot.update(time)
     assert len(robot.messages) == 3
     assert np.isnan(robot.commands.position).all()
-
-
-@pytest.mark.parametrize(("into", "expected"), [((), 0.5), (("lower",), np.nan)])
-def test_into_another_controller_a_servos_speed_is_no_velocity(into, expected):
-    """Beside a servo's position it is a magnitude: as a reference, the joint would be sent on by it."""
-    robot = Stage(JointGroupPosVelController, TWO, into=into)
-    robot.sent.velocity[:] = 0.5
-    robot.activate()
-    np.testing.assert_array_equal(robot.commands.velocity, [expected] * 2)
