@@ -16,6 +16,8 @@ from dxlrun.control.realtime_grants import Grant, highest_priority, lowest_nice
 from dxlrun.run.run_processes import RECORDER_NICE
 from dxlrun.run.run_summary import granted_text, refusals, show_grants
 
+pytestmark = pytest.mark.long
+
 GRANTS = (
     Grant("timer slack", True, "timer slack 1 ns"),
     Grant("scheduler", False, "it was refused, so that", "allow it with `a long command`"),

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 import pytest
 from msgspec.structs import replace
+from tests.kit.awaited import until
 from tests.kit.campaigns import campaign
 from tests.kit.stories import plugin_folder
 
@@ -426,15 +427,13 @@ def test_a_kill_while_a_file_is_written_leaves_the_old_one_or_the_new(tmp_path, 
 
 
 @campaign(ci=1, night=6, release=25)
-def test_a_kept_state_is_whole_when_the_loop_was_killed_at_any_time(  # noqa: PLR0917  fixtures
-    start, robot, installed, wait_for, amount, chance
-):
+def test_a_kept_state_is_whole_when_the_loop_was_killed_at_any_time(start, robot, installed, amount, chance):
     robot.write_text(ROBOT.replace("size: 20000", "size: 20000, every: 10").replace("keeper", "killed"))
     place = Path(os.environ["XDG_STATE_HOME"]) / "dxlrun/killed/simulated/runs.kept"
     last = 0
     for _ in range(int(amount)):
-        running = start("--no-record", robot=robot, path=installed)
-        wait_for(lambda: place.exists() and _number(place) > last, "a kept state")  # noqa: B023
+        running = start("--no-record", robot=robot, plugins=installed)
+        until(lambda: place.exists() and _number(place) > last, "a kept state")  # noqa: B023
         last = _number(place)
         threading.Event().wait(chance.uniform(0.0, 0.3))
         os.kill(running.child("run.loop_process"), signal.SIGKILL)
@@ -443,7 +442,7 @@ def test_a_kept_state_is_whole_when_the_loop_was_killed_at_any_time(  # noqa: PL
         assert "Traceback" not in err
         assert _number(place) >= last
         last = _number(place)
-    running = start("--no-record", "--duration", "0.5", robot=robot, path=installed)
+    running = start("--no-record", "--duration", "0.5", robot=robot, plugins=installed)
     code, _, err = running.finish()
     assert (code, err) == (0, "")
     assert _number(place) > last + 2, "the run went on from what was kept"

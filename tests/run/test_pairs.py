@@ -3,7 +3,7 @@
 One survivor of main process, guardian and loop takes torque off. Recorder and gateway do not end control.
 Afterwards nothing of the run is left but processes that are stopped, or that wait for one that is, and
 `dxlrun stop` ends these. Torque must be off in time after the last hit on these three, not counting the time
-for which the kernel let emulator, survivors or this process wait for a processor. Each test prints both.
+for which the kernel let emulator, survivors or this process wait for a processor. Each pair prints both.
 
 CI runs `TELLING`, the first eight pairs. All ordered pairs, before a release:
 
@@ -18,19 +18,18 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import pytest
-from tests.kit.awaited import DEADLINE_S
+from tests.kit.awaited import DEADLINE_S, until
 from tests.kit.campaigns import campaign
+from tests.kit.live_run import DXLRUN, ROBOT, Running, Start, together
 
 from dxlrun.remote.sockets import sockets
 
 EMULATOR = Path(__file__).parents[1] / "kit/emulator.py"
-DXLRUN = Path(sys.executable).with_name("dxlrun")
 IDS = ("3", "7")
 MODULES = {
     "main": "dxlrun",
@@ -78,14 +77,6 @@ PAIRS = tuple(
     dict.fromkeys((*TELLING, *((first, second) for first in HITS for second in HITS if first != second)))
 )
 """All 90 pairs, the telling ones first."""
-
-
-@pytest.fixture
-def hits(number: int) -> tuple[Hit, Hit, float]:
-    """The pair of a test, and the pause between its hits, s."""
-    first, second = PAIRS[number]
-    print(first, second)
-    return first, second, PAUSES_S[number % len(PAUSES_S)]
 
 
 class Servos(NamedTuple):
@@ -140,64 +131,55 @@ def waited_ns(pid: int) -> int:
     return 0
 
 
-@pytest.fixture
-def servos(tmp_path: Path) -> Iterator[Servos]:
-    journal = tmp_path / "journal.jsonl"
+@contextmanager
+def emulated(folder: Path) -> Iterator[Servos]:
+    """Emulate servos in a process."""
+    journal = folder / "journal.jsonl"
     command = [sys.executable, str(EMULATOR), str(journal), *IDS]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout
-        yield Servos(process.stdout.readline().strip(), journal, process.pid)
-        process.kill()
+        try:
+            assert process.stdout
+            yield Servos(process.stdout.readline().strip(), journal, process.pid)
+        finally:
+            process.kill()
 
 
-@pytest.fixture
-def run(
-    hits: tuple[Hit, Hit, float],
-    start: Callable[..., Any],
-    servos: Servos,
-    tmp_path: Path,
-    wait_for: Callable[..., Any],
-) -> Any:
-    """A run of `pair` under a name of its own, once it controls the servos; a gateway only to be hit."""
-    gateway = "gateway" in {hit.process for hit in hits[:2]}
-    robot = tmp_path / "pairs.yaml"
-    text = (tmp_path / "pair.yaml").read_text().replace("latency: 1 ms", "latency: 4 ms")
-    name = f"pair_{os.getpid()}"
-    robot.write_text(text.replace("name: pair", f"name: {name}", 1))
-    running = start(f"port:={servos.port}", robot=robot, gateway=gateway)
-
-    def complete() -> bool:
-        assert running.process.poll() is None, running.finish()
-        wanted = {module for name, module in MODULES.items() if gateway or name != "gateway"}
-        return wanted <= set(running.processes())
-
-    wait_for(complete, "all processes")
+def controlled(start: Start, folder: Path, servos: Servos, *, gateway: bool) -> Running:
+    """Return a run of `pair` under its own name that controls the servos; a gateway only to be hit."""
+    name = f"pair_{os.getpid()}_{folder.name}"
+    robot = folder / "pairs.yaml"
+    robot.write_text(
+        ROBOT.replace("latency: 1 ms", "latency: 4 ms").replace("name: pair", f"name: {name}", 1)
+    )
+    run = start(f"port:={servos.port}", robot=robot, gateway=gateway, directory=folder)
+    wanted = {module for name, module in MODULES.items() if gateway or name != "gateway"}
+    until(lambda: wanted <= set(run.processes()), "all processes", check=run.lives)
     if gateway:  # before it listens, its end ends a run on a real port: the robot was held for it
-        wait_for(lambda: name in sockets(), "the socket")
-    wait_for(lambda: sum(servos.torque().values()) == len(IDS), "torque")
-    in_control(servos, wait_for)
-    return running
+        until(lambda: name in sockets(), "the socket", check=run.lives)
+    until(lambda: sum(servos.torque().values()) == len(IDS), "torque", check=run.lives)
+    in_control(servos)
+    return run
 
 
-def in_control(servos: Servos, wait_for: Callable[..., Any]) -> None:
+def in_control(servos: Servos) -> None:
     """Wait for twenty more exchanges, torque on."""
     before = len(servos.entries("instruction"))
-    wait_for(lambda: len(servos.entries("instruction")) > before + 20, "more exchanges")
+    until(lambda: len(servos.entries("instruction")) > before + 20, "more exchanges")
     assert set(servos.torque().values()) == {1}
 
 
-def end_what_is_left(run: Any, wait_for: Callable[..., Any]) -> str:
+def end_what_is_left(run: Running) -> str:
     """Wait until the processes are gone, or end them by `dxlrun stop`, which must find them.
 
     Return what the run wrote to standard error.
     """
     with suppress(subprocess.TimeoutExpired):
         run.process.wait(SETTLED_S)  # reaped: a dead child of this process is none that is left
-    until = time.monotonic() + SETTLED_S
-    while not run.gone() and time.monotonic() < until:
+    end = time.monotonic() + SETTLED_S
+    while not run.gone() and time.monotonic() < end:
         time.sleep(0.05)
     if left := run.processes():
-        name = f"pair_{os.getpid()}"
+        name = f"pair_{os.getpid()}_{run.directory.name}"
         done = subprocess.run(
             [DXLRUN, "stop", "--robot", name], capture_output=True, text=True, timeout=DEADLINE_S, check=False
         )
@@ -205,48 +187,61 @@ def end_what_is_left(run: Any, wait_for: Callable[..., Any]) -> str:
         assert done.returncode == 0, done.stderr
         assert name in done.stdout
     _, _, err = run.finish()
-    wait_for(run.gone, "the end of every process")
+    until(run.gone, "the end of every process")
     assert "Traceback" not in err
-    return str(err)
+    return err
+
+
+def check_pair(start: Start, folder: Path, pair: tuple[Hit, Hit], pause_s: float, longest_ms: float) -> None:
+    """Let two hits happen to a run, and judge when torque was off."""
+    folder.mkdir()
+    with emulated(folder) as servos:
+        run = controlled(start, folder, servos, gateway="gateway" in {hit.process for hit in pair})
+        pids = run.processes()
+        starvation = Starvation(os.getpid(), servos.pid, *(pids[MODULES[one]] for one in IN_CONTROL))
+        hit_ns = 0
+        for hit in pair:
+            if hit.process in IN_CONTROL:
+                hit_ns = time.monotonic_ns()
+            with suppress(ProcessLookupError):  # it ended because of the first
+                os.kill(pids[MODULES[hit.process]], signal.Signals[f"SIG{hit.signal}"])
+            time.sleep(pause_s)
+        if not hit_ns:
+            in_control(servos)
+            run.signal(signal.SIGINT)
+
+        def limp() -> bool:
+            starvation.look()
+            return not any(servos.torque().values())
+
+        until(limp, "torque off")
+        if hit_ns:
+            after_ms = (servos.limp_since_ns() - hit_ns) / 1e6
+            starved_ms = starvation.total_ms
+            print(
+                f"TORQUE OFF after {after_ms:.0f} ms, {starved_ms:.0f} ms without a processor: "
+                f"{pair[0]}, {pair[1]} {pause_s * 1e3:.0f} ms later"
+            )
+            assert after_ms - starved_ms < longest_ms
+        err = end_what_is_left(run)
+        assert not any(servos.torque().values())
+    if pair == (Hit("main", "STOP"), Hit("gateway", "STOP")):  # as `fg` shows it
+        assert "was suspended (such as by Ctrl-Z)" in " ".join(err.split())
 
 
 @campaign(ci=8, night=20, release=len(PAIRS))
-def test_one_survivor_takes_torque_off(
-    run: Any,
-    servos: Servos,
-    wait_for: Callable[..., Any],
-    hits: tuple[Hit, Hit, float],
-    amount: float,
-) -> None:
-    first, second, pause_s = hits
-    longest_ms = LONGEST_MS["release" if amount == len(PAIRS) else "ci"]
-    pids = run.processes()
-    starvation = Starvation(os.getpid(), servos.pid, *(pids[MODULES[one]] for one in IN_CONTROL))
-    hit_ns = 0
-    for hit in (first, second):
-        if hit.process in IN_CONTROL:
-            hit_ns = time.monotonic_ns()
-        with suppress(ProcessLookupError):  # it ended because of the first
-            os.kill(pids[MODULES[hit.process]], signal.Signals[f"SIG{hit.signal}"])
-        time.sleep(pause_s)
-    if not hit_ns:
-        in_control(servos, wait_for)
-        run.signal(signal.SIGINT)
-
-    def limp() -> bool:
-        starvation.look()
-        return not any(servos.torque().values())
-
-    wait_for(limp, "torque off")
-    if hit_ns:
-        after_ms = (servos.limp_since_ns() - hit_ns) / 1e6
-        starved_ms = starvation.total_ms
-        print(
-            f"TORQUE OFF after {after_ms:.0f} ms, {starved_ms:.0f} ms without a processor: "
-            f"{first}, {second} {pause_s * 1e3:.0f} ms later"
+def test_one_survivor_takes_torque_off(start: Start, tmp_path: Path, amount: float) -> None:
+    full = amount == len(PAIRS)
+    longest_ms = LONGEST_MS["release" if full else "ci"]
+    cases = {
+        f"{first}, {second}": (
+            start,
+            tmp_path / str(number),
+            (first, second),
+            PAUSES_S[number % len(PAUSES_S)],
+            longest_ms,
         )
-        assert after_ms - starved_ms < longest_ms
-    err = end_what_is_left(run, wait_for)
-    assert not any(servos.torque().values())
-    if (first, second) == (Hit("main", "STOP"), Hit("gateway", "STOP")):  # as `fg` shows it
-        assert "was suspended (such as by Ctrl-Z)" in " ".join(err.split())
+        for number, (first, second) in enumerate(PAIRS[: int(amount)])
+    }
+    assert cases
+    together(check_pair, cases, most=1 if full else 4)

@@ -1,16 +1,14 @@
-"""Policies of whole runs in real time: signals, a second Ctrl-C, a loop that is gone; judged by the wire."""
+"""The guardian makes a robot safe whose loop is gone: in one process; whole runs are in ends.txt."""
 
 from __future__ import annotations
 
 import os
-import signal
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import pytest
 from tests.kit.decoded import decode_packets
+from tests.kit.live_run import ROBOT
 
 from dxlrun.channels.event_records import Event, Severity
 from dxlrun.channels.heartbeat import Heartbeat, Phase
@@ -27,81 +25,8 @@ from dxlsim.virtual_ports import VirtualPorts
 from dxlwire.exchange.bus_engine import Lines
 from dxlwire.packets import PacketKind
 
-Start = Callable[..., Any]
 LIGHTS = Path(__file__).parents[2] / "plugins/lights"
 pytestmark = pytest.mark.usefixtures("no_memory_left")
-
-POLICIES = """\
-poses:
-  home: {{pan: 60 deg, tilt: 60 deg}}
-policies: {{on_exit: [{{pose: home, speed: {speed}}}, {last}], on_fault: hold, exit_timeout: {timeout}}}
-"""
-
-
-@pytest.fixture
-def holding(start, tmp_path):
-    """Start the robot with policies, and wait until it sends goals."""
-
-    def begin(speed, last, timeout):
-        robot = tmp_path / "holding.yaml"
-        text = (tmp_path / "pair.yaml").read_text()
-        robot.write_text(text + POLICIES.format(speed=speed, last=last, timeout=timeout))
-        run = start(robot=robot)
-        run.wait_until_moving()
-        return run
-
-    return begin
-
-
-def goals(run: Any) -> list[int]:
-    """Return the goals of pan that cycles sent, ticks."""
-    sent = (entry.data for entry in run.ledger() if entry.direction == "in")
-    return [int.from_bytes(data[8:10], "little") for data in sent if data[4:8] == bytes((0x83, 30, 4, 3))]
-
-
-def test_a_second_interrupt_cuts_torque_in_the_middle_of_a_policy(holding, all_limp, wait_for):
-    run = holding("20 deg/s", "hold", "12 s")
-    run.signal(signal.SIGINT)
-    wait_for(lambda: goals(run)[-1] != goals(run)[0], "the pose's first goals")
-    run.signal(signal.SIGTERM)  # another one, because two of a kind at once may arrive as one
-    code, _, err = run.finish()
-    assert code == 130, err
-    assert "torque was cut on request" in err
-    assert all_limp(run)
-    assert goals(run)[-1] < 700, "the pose is at 716: it was cut on its way"
-
-
-def test_a_second_interrupt_counts_though_the_guardian_never_heard_of_it(holding, all_limp):
-    run = holding("20 deg/s", "hold", "12 s")
-    guardian = run.child("dxlrun.run.guardian")
-    os.kill(guardian, signal.SIGSTOP)
-    run.signal(signal.SIGINT)
-    run.signal(signal.SIGTERM)
-    os.kill(guardian, signal.SIGKILL)
-    run.finish()
-    assert all_limp(run)
-    assert goals(run)[-1] < 700, "the pose is at 716: it was cut on its way"
-
-
-def test_an_interrupt_takes_the_robot_to_its_pose_and_holds_it_there(holding, all_limp):
-    run = holding("180 deg/s", "hold", "4 s")
-    run.signal(signal.SIGINT)
-    code, _, err = run.finish()
-    assert code == 130
-    assert "torque stays on by the policy" in err
-    assert "--take-over" in err
-    assert goals(run)[-1] == 716
-    assert not all_limp(run)
-
-
-def test_the_guardian_holds_a_robot_whose_loop_is_gone_when_the_policy_is_hold(holding, all_limp):
-    run = holding("180 deg/s", "limp", "4 s")
-    os.kill(run.child("dxlrun.run.loop_process"), signal.SIGKILL)
-    code, _, err = run.finish()
-    assert code == 1
-    assert "the loop's process exited unexpectedly (signal SIGKILL)" in err
-    assert "torque stays on by the policy" in err
-    assert not all_limp(run)
 
 
 @pytest.mark.parametrize(
@@ -113,12 +38,12 @@ def test_the_guardian_holds_a_robot_whose_loop_is_gone_when_the_policy_is_hold(h
         ("on_exit", Phase.RUNNING, False),
     ],
 )
-def test_the_guardian_holds_only_a_robot_that_was_running_by_the_policy_for_faults(  # noqa: PLR0917  fixtures
-    start, tmp_path, monkeypatch, policy, phase, holds
+def test_the_guardian_holds_only_a_robot_that_was_running_by_the_policy_for_faults(
+    tmp_path, monkeypatch, policy, phase, holds
 ):
     """In a set-up, and while torque is switched off, some servos have torque and others have not."""
     robot = tmp_path / "holding.yaml"
-    robot.write_text((tmp_path / "pair.yaml").read_text() + f"policies: {{{policy}: hold}}\n")
+    robot.write_text(ROBOT + f"policies: {{{policy}: hold}}\n")
     plan = plan_of(robot)
     memory = create_memory(plan)
     Heartbeat(memory.heartbeat).enter_phase(phase)
@@ -215,7 +140,8 @@ def test_a_safe_stop_names_the_servos_that_did_not_confirm_torque_off(safe_stop,
     assert [servo.torque_on for servo in robot.buses[0].servos] == [False, silent]
 
 
-def test_what_the_loop_had_on_its_desk_when_it_died_comes_into_the_log(start, tmp_path):
+def test_what_the_loop_had_on_its_desk_when_it_died_comes_into_the_log(tmp_path):
+    (tmp_path / "pair.yaml").write_text(ROBOT)
     plan = plan_of(tmp_path / "pair.yaml")
     memory = create_memory(plan)
     desk = PacketBatch(RingWriter(memory.packets), mapped(memory.desk))

@@ -17,22 +17,19 @@ import random
 import re
 import signal
 import subprocess
-import sys
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import pytest
 from tests.kit.answers import result_of
-from tests.kit.awaited import DEADLINE_S
+from tests.kit.awaited import DEADLINE_S, until
 from tests.kit.campaigns import campaign
+from tests.kit.live_run import DXLRUN, Running, Start
 
 from dxlrun.channels.event_records import EventCode
 from dxlsim.bus.ledger import LedgerEntry, read_ledger
 from dxlwire.packets import PacketKind
 
-DXLRUN = Path(sys.executable).with_name("dxlrun")
 MOST_PULLS = 10
 """Of one run."""
 ENDS = {"loop": ("loop_process",), "both": ("guardian", "loop_process"), "none": ()}
@@ -118,26 +115,26 @@ def servos(tmp_path):
 
 
 @campaign(ci=1, night=3, release=10)
-def test_an_adapter_that_is_pulled_costs_the_other_bus_nothing_and_comes_back(  # noqa: PLR0917  fixtures
-    start: Callable[..., Any],
+def test_an_adapter_that_is_pulled_costs_the_other_bus_nothing_and_comes_back(
+    start: Start,
     servos: Servos,
     tmp_path: Path,
+    *,
     number: int,
     amount: float,
     chance: random.Random,
-    wait_for: Callable[..., Any],
 ) -> None:
     drawn = draw_pulls(chance, min(2 * int(amount), MOST_PULLS))
     killed = tuple(ENDS)[number % len(ENDS)]
     print(f"at the end, {killed} killed")
     run = start(*(f"{bus}:={link}" for bus, link in servos.links.items()), robot=tmp_path / "pulled.yaml")
     for name in NAMES:
-        wait_for(lambda name=name: len(servos.of(name, "in")) > 60, f"cycles on {name}")
+        until(lambda name=name: len(servos.of(name, "in")) > 60, f"cycles on {name}")
     for bus, pause_ms, gone_ms in drawn:
-        pull(servos, bus, pause_ms, gone_ms, wait_for)
+        pull(servos, bus, pause_ms, gone_ms)
     for name in NAMES:
         count = len(servos.of(name, "in"))
-        wait_for(lambda name=name, count=count: len(servos.of(name, "in")) > count + 20, f"more on {name}")
+        until(lambda name=name, count=count: len(servos.of(name, "in")) > count + 20, f"more on {name}")
     pids = [run.child(f"dxlrun.run.{victim}") for victim in ENDS[killed]]
     for pid in pids:
         os.kill(pid, signal.SIGSTOP)  # neither sees the other one die
@@ -163,15 +160,15 @@ def test_an_adapter_that_is_pulled_costs_the_other_bus_nothing_and_comes_back(  
         the_log_is_the_wire(run, servos, drawn)
 
 
-def pull(servos: Servos, bus: str, pause_ms: int, gone_ms: int, wait_for: Callable[..., Any]) -> None:
+def pull(servos: Servos, bus: str, pause_ms: int, gone_ms: int) -> None:
     """Let the other bus do some cycles, pull the adapter, wait until all its servos have answered again."""
     print(f"unplug bus={bus} for={gone_ms}ms, {pause_ms} ms after the one before was over")
     (other,) = (name for name in NAMES if name != bus)
     before, packets = servos.plugged_in(bus), len(servos.of(other, "in"))
-    wait_for(lambda: len(servos.of(other, "in")) >= packets + pause_ms // 50, "the moment")
+    until(lambda: len(servos.of(other, "in")) >= packets + pause_ms // 50, "the moment")
     servos.fault(f"unplug bus={bus} for={gone_ms}ms")
-    wait_for(lambda: servos.plugged_in(bus) > before, f"the adapter of {bus}")
-    wait_for(lambda: servos.heard_since_return(bus), f"the servos of {bus}")
+    until(lambda: servos.plugged_in(bus) > before, f"the adapter of {bus}")
+    until(lambda: servos.heard_since_return(bus), f"the servos of {bus}")
 
 
 def the_other_bus_goes_on(servos: Servos) -> None:
@@ -197,7 +194,7 @@ def everybody_is_limp(servos: Servos) -> None:
             assert value == 0, (bus, servo_id, status[:12].hex(" "))
 
 
-def the_log_tells_each_loss_and_return(run: Any, drawn: list[tuple[str, int, int]]) -> None:
+def the_log_tells_each_loss_and_return(run: Running, drawn: list[tuple[str, int, int]]) -> None:
     events = run.log().events
     for name in NAMES:
         times = sum(bus == name for bus, *_ in drawn)
@@ -206,7 +203,7 @@ def the_log_tells_each_loss_and_return(run: Any, drawn: list[tuple[str, int, int
             assert len(found) == times, (name, code.name, found)
 
 
-def the_log_is_the_wire(run: Any, servos: Servos, drawn: list[tuple[str, int, int]]) -> None:
+def the_log_is_the_wire(run: Running, servos: Servos, drawn: list[tuple[str, int, int]]) -> None:
     """Compare all bytes, but those that were on their way when an adapter went."""
     log = run.log()
     for index, name in enumerate(NAMES):

@@ -15,6 +15,7 @@ import msgspec
 import pytest
 from msgspec.json import Decoder
 from rich.console import Console
+from tests.kit.live_run import ROBOT
 
 from dxlrun.channels import child_processes, heartbeat
 from dxlrun.channels.child_processes import Cut, LineLost, Stop
@@ -22,11 +23,10 @@ from dxlrun.channels.cycle import Commands, States
 from dxlrun.channels.event_records import Event, EventBody, EventCode, EventRing, Severity, SimulationStall
 from dxlrun.channels.heartbeat import ControllerMethod, Heartbeat, Phase, ProcessorTime, Standstill
 from dxlrun.channels.ring import Handover
-from dxlrun.compile.robot_compiler import compile_robot
 from dxlrun.compile.simulation import simulation_of
 from dxlrun.control.context import StopFlag
-from dxlrun.description.reading import read_robot
 from dxlrun.dynamixel.dynamixel_hardware import DynamixelHardware, ServoArrays
+from dxlrun.plan.robot_plan import Plan
 from dxlrun.process_table import read_stat
 from dxlrun.run import process_watch, supervisor
 from dxlrun.run.guardian import LONGEST_LOOK_NS, Ended, Guardian, GuardianMessage
@@ -57,6 +57,13 @@ from dxlwire.port.reopening import KeptLines
 pytestmark = pytest.mark.usefixtures("no_memory_left")
 
 MS = 1_000_000
+
+
+@pytest.fixture(scope="module")
+def plan(tmp_path_factory):
+    path = tmp_path_factory.mktemp("pair") / "pair.yaml"
+    path.write_text(ROBOT)
+    return plan_of(path)
 
 
 @pytest.fixture
@@ -204,8 +211,7 @@ def test_the_first_cycle_may_take_longer_never_less(watcher, period_ms, first, l
     ],
 )
 def test_a_loop_that_never_gets_on_is_ended(  # noqa: PLR0917  fixtures
-    start: object,
-    tmp_path: Path,
+    plan: Plan,
     monkeypatch: pytest.MonkeyPatch,
     phase: Phase,
     patience: str,
@@ -215,7 +221,6 @@ def test_a_loop_that_never_gets_on_is_ended(  # noqa: PLR0917  fixtures
 ) -> None:
     """Such as one whose plug-in waits for a server in on_configure, or for a child process at the end."""
     monkeypatch.setattr(process_watch, patience, 100 * MS)
-    plan = plan_of(tmp_path / "pair.yaml")
     memory = create_memory(plan)
     page = Heartbeat(memory.heartbeat)
     page.name_controller(1, "arm")
@@ -265,23 +270,22 @@ def test_only_a_set_up_is_given_up_and_only_once(page):
     assert page.beats == 5
 
 
-def test_a_stop_anywhere_in_the_set_up_leaves_no_servo_with_torque(start, tmp_path, monkeypatch):
+def test_a_stop_anywhere_in_the_set_up_leaves_no_servo_with_torque(plan, monkeypatch):
     """Ask to stop at the first transaction, at the second ...: until one set-up is through without us."""
     monkeypatch.setattr(bus_engine, "BEAT_NS", 0)
     given = []
-    while (found := set_up(tmp_path, len(given) + 1)) is not None:
+    while (found := set_up(plan, len(given) + 1)) is not None:
         given.append(found)
     assert len(given) > 20
     assert any(given)
     assert not all(given)
 
 
-def set_up(tmp_path: Path, transactions: int) -> bool | None:
+def set_up(plan: Plan, transactions: int) -> bool | None:
     """Ask to stop after so many; return whether torque had been given, None when the set-up was through."""
     descriptor = heartbeat.create()
     page = Heartbeat(descriptor)
     os.close(descriptor)
-    plan = compile_robot(read_robot(tmp_path / "pair.yaml", {}), [], None).plan
     stop = StopFlag()
     pulse = Pulse(page, stop, Unwatched(), no_events(), no_stalls(), lambda: 0)
     count = 0
@@ -334,9 +338,8 @@ def reason_to_kill(made: Guardian, processor: ProcessorTime | None = None) -> st
 
 
 @pytest.fixture
-def watcher(start, tmp_path):
+def watcher(plan):
     """A guardian of the robot `pair` on virtual time, the terminal's end of its line, and the loop's page."""
-    plan = compile_robot(read_robot(tmp_path / "pair.yaml", {}), [], None).plan
     memory = create_memory(plan)
     control, terminal = child_processes.message_channel(Decoder(Stop | Cut))
     made = Guardian(guardian_job(plan, {}, memory, take_over=False), control)
@@ -632,9 +635,8 @@ class HangingGuardian:
     ],
 )
 def test_a_supervisor_waits_for_a_guardian_only_shortly_once_torque_is_to_be_cut(  # noqa: PLR0917  fixtures
-    start, tmp_path, monkeypatch, signals, phase, least_s, most_s
+    plan, monkeypatch, signals, phase, least_s, most_s
 ):
-    plan = plan_of(tmp_path / "pair.yaml")
     memory = create_memory(plan)
     Heartbeat(memory.heartbeat).enter_phase(phase)
     run = supervisor._Run(plan, RunOptions(gateway=False), memory, Console(file=io.StringIO()))
