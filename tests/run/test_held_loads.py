@@ -14,18 +14,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.kit.stories import Clients, prepared, replayed, silence
+from tests.kit.sampled_run import SampledRun, texts
+from tests.kit.stories import prepared, silence
 
 from dxlrun.channels.cycle import Floats, Torque
 from dxlrun.channels.event_records import EventCode
-from dxlrun.log.log_reader import Log, open_log, read_log
-from dxlrun.testing import VirtualRobot, simulated_robot
+from dxlrun.log.log_reader import Log, open_log
 
-RATE, PERIOD_MS = 100, 10
 TICK_DEG = 360 / 4096
 HELD_DEG = 0.5
 """By how much a joint that a law holds may settle: an integral is still on its way to the load."""
-COMMANDED_CYCLE = 20
+COMMANDED_MS = 200
 MOVING_MS, RESTING_MS, GONE_MS = 700, 2200, 600
 """When the elbow is lost: on the way of the trajectory, or behind it; and for how long."""
 NOTICED_MS = 80
@@ -38,7 +37,7 @@ SHAPE = f"""\
 name: held_loads
 buses:
   main: {{port: sim, protocol: 2.0, baud_rate: 4_000_000, adapter: {{kind: direct}}, return_delay_time: 0 us}}
-loop: {{rate: {RATE}}}
+loop: {{rate: 100}}
 joint_defaults:
   bus: main
   model: XM430-W350
@@ -128,43 +127,24 @@ CHAINS = {
 FLOATING = Chain((f"gravity: {{type: gravity_compensation, {OWN}, command_interface: effort}}",), "", "")
 
 
-class Arm:
-    """A robot on virtual time that got its command; its shafts are sampled."""
+class Arm(SampledRun):
+    """A robot on virtual time that got its command."""
 
     def __init__(self, folder: Path, chain: Chain, seconds: float = END_S) -> None:
         (folder / "arm.urdf").write_text(URDF)
-        (folder / "arm.yaml").write_text(SHAPE + "".join(f"  {line}\n" for line in chain.controllers))
-        self.path = folder / "run.mcap"
-        self.robot: VirtualRobot = simulated_robot(folder / "arm.yaml", duration_s=seconds, log=self.path)
-        self.bus = self.robot.buses[0]
-        self.samples: list[tuple[float, float, float]] = []
-        self.asked: dict[int, list[Any]] = {}
+        super().__init__(folder, SHAPE + "".join(f"  {line}\n" for line in chain.controllers), seconds)
         if chain.kind:
-            self.asked[COMMANDED_CYCLE] = [prepared(self.robot, chain.to, chain.kind, **chain.command)]
-        self._sample()
-
-    def _sample(self) -> None:
-        angles = [math.degrees(self.bus.servo(number).shaft.angle - math.pi) for number in (1, 2)]
-        self.samples.append((self.bus.now_ns / 1e6, *angles))
-        self.bus.at(self.bus.now_ns + PERIOD_MS * 1_000_000, self._sample)
+            self.ask(COMMANDED_MS, prepared(self.robot, chain.to, chain.kind, **chain.command))
 
     def lose(self, at_ms: float, fault: str) -> None:
         """Let the elbow not answer for a while, or be without power."""
         if fault == "silent":
             silence(self.robot, [2], at_ms, at_ms + GONE_MS)
         else:
-            back_ns = round((at_ms + GONE_MS) * 1e6)
-            self.bus.at(round(at_ms * 1e6), lambda: self.bus.servo(2).cut_power(back_ns))
+            self.at(at_ms, lambda: self.servos["elbow"].cut_power(round((at_ms + GONE_MS) * 1e6)))
 
-    def run(self) -> Log:
-        Clients(self.robot, self.asked)
-        result = self.robot.run()
-        assert (result.reason, result.detail) == ("ended", "")
-        return read_log(self.path)
-
-    def shoulder(self, from_ms: float, to_ms: float) -> Floats:
-        """Return the shoulder's angles between two times, deg."""
-        return np.array([near for at, near, _ in self.samples if from_ms <= at < to_ms])
+    def shoulder_deg(self, from_ms: float, to_ms: float) -> Floats:
+        return np.degrees(self.shaft("shoulder", from_ms, to_ms))
 
 
 @pytest.mark.parametrize(
@@ -180,10 +160,10 @@ def test_a_loaded_joint_stays_while_another_one_of_its_controllers_is_lost(tmp_p
     arm.lose(RESTING_MS, fault)
     log = arm.run()
     stopping = 5 if "velocities" in CHAINS[name].command else 1
-    held = arm.shoulder(RESTING_MS + stopping * NOTICED_MS, RESTING_MS + GONE_MS)
+    held = arm.shoulder_deg(RESTING_MS + stopping * NOTICED_MS, RESTING_MS + GONE_MS)
     assert np.ptp(held) <= HELD_DEG
     assert commanded_when_lost(log) == 0
-    goals = [event.text for event in log.events if event.code == EventCode.GOAL_ENDED]
+    goals = texts(log, EventCode.GOAL_ENDED)
     assert all("reached" in text for text in goals)
 
 
@@ -202,12 +182,11 @@ def test_a_moving_joint_comes_to_rest_while_another_one_is_lost_and_a_replay_dec
     arm = Arm(tmp_path, CHAINS[name])
     arm.lose(MOVING_MS, "silent")
     arm.run()
-    before = arm.shoulder(MOVING_MS, MOVING_MS + NOTICED_MS)
-    held = arm.shoulder(MOVING_MS + NOTICED_MS, MOVING_MS + GONE_MS)
+    before = arm.shoulder_deg(MOVING_MS, MOVING_MS + NOTICED_MS)
+    held = arm.shoulder_deg(MOVING_MS + NOTICED_MS, MOVING_MS + GONE_MS)
     assert np.ptp(before) > 1, "it did not move"
     assert np.ptp(held) < 3
     assert np.ptp(held[25:]) < 0.5
-    replayed(arm.path)
 
 
 def test_the_law_and_its_topic_go_on_while_a_joint_is_lost(tmp_path):
@@ -224,15 +203,15 @@ def test_a_floating_joint_floats_while_another_one_is_lost(tmp_path, fault):
     arm = Arm(tmp_path, FLOATING)
     arm.lose(RESTING_MS, fault)
     arm.run()
-    assert np.ptp(arm.shoulder(300, RESTING_MS)) < 10, "the law does not carry it"
-    assert np.ptp(arm.shoulder(RESTING_MS, END_S * 1000)) <= 4 * TICK_DEG
+    assert np.ptp(arm.shoulder_deg(300, RESTING_MS)) < 10, "the law does not carry it"
+    assert np.ptp(arm.shoulder_deg(RESTING_MS, END_S * 1000)) <= 4 * TICK_DEG
 
 
 def test_a_goal_in_which_a_joint_is_lost_is_aborted_with_servo_and_distance(tmp_path):
     arm = Arm(tmp_path, CHAINS["trajectory"])
-    arm.bus.at(MOVING_MS * 1_000_000, lambda: arm.bus.servo(2).silence(True))
+    arm.at(MOVING_MS, arm.servos["elbow"].silence)
     log = arm.run()
-    (text,) = [event.text for event in log.events if event.code == EventCode.GOAL_ENDED]
+    (text,) = texts(log, EventCode.GOAL_ENDED)
     found = re.fullmatch(
         r"goal 1 aborted: after 2\.2\d+ s, joint elbow \(ID 2 on bus main\) does not answer; "
         r"it is (\d+\.\d+) deg off",
@@ -252,13 +231,12 @@ KEYFRAMES = (
 def test_the_motion_of_an_activation_is_not_begun_again_when_a_joint_was_given_torque(tmp_path):
     arm = Arm(tmp_path, Chain((KEYFRAMES,), "", ""), seconds=5.0)
     arm.lose(MOVING_MS, "without power")
-    play = prepared(arm.robot, "player", "play", motion="wave")
-    arm.asked[400] = [play]
+    arm.ask(4000, prepared(arm.robot, "player", "play", motion="wave"))
     log = arm.run()
     back_ms = next(event.t_ns for event in log.events if event.code == EventCode.SERVO_BACK) / 1e6
-    assert np.ptp(arm.shoulder(0, MOVING_MS)) > 15
-    assert np.ptp(arm.shoulder(back_ms, 400 * PERIOD_MS)) <= HELD_DEG
-    assert np.ptp(arm.shoulder(400 * PERIOD_MS, 5000)) > 15
+    assert np.ptp(arm.shoulder_deg(0, MOVING_MS)) > 15
+    assert np.ptp(arm.shoulder_deg(back_ms, 4000)) <= HELD_DEG
+    assert np.ptp(arm.shoulder_deg(4000, 5000)) > 15
 
 
 def test_a_group_of_efforts_carries_its_other_joint_when_one_was_given_torque(tmp_path):
@@ -266,5 +244,5 @@ def test_a_group_of_efforts_carries_its_other_joint_when_one_was_given_torque(tm
     arm.lose(RESTING_MS - 500, "without power")
     log = arm.run()
     assert [event for event in log.events if "restarted at the measured positions" in event.text]
-    assert np.ptp(arm.shoulder(RESTING_MS - 500, END_S * 1000)) <= HELD_DEG
+    assert np.ptp(arm.shoulder_deg(RESTING_MS - 500, END_S * 1000)) <= HELD_DEG
     assert log.cycles["goal_effort"][-1].tolist() == pytest.approx([0.2, 0.0])
