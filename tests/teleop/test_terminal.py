@@ -21,6 +21,8 @@ from dxlrun import RemoteRobot, connect, running
 from dxlrun.testing import plan_of
 from dxlsim.bus.ledger import read_ledger
 
+pytestmark = pytest.mark.long
+
 ROBOT = Path(__file__).parents[2] / "robots" / "diff_drive.yaml"
 GOAL_VELOCITY = 104
 
