@@ -39,7 +39,7 @@ TESTS = (
     "tests/run/channels tests/sensors/test_slot.py tests/compile/test_cross_checks.py "
     "tests/dxlwire/test_{protocol1,protocol2,receiver,bus}.py "
     "tests/dynamixel/test_{kernel,kernel_rules,goals,samples}.py "
-    "tests/control/test_{gate,gate_law,loop,manager}.py "
+    "tests/control/test_{gate,loop,manager}.py "
     "tests/log/test_{schemas_and_cdr,packet_messages,log,recorder}.py"
 )
 """The exchange with its kernel, what processes share, gate and loop, checks of robot files, the log."""
