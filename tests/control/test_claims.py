@@ -1,12 +1,21 @@
-"""Claims: what two controllers may not have both."""
+"""Claims: what two controllers may not have both, and so what leaves and what enters."""
 
 from __future__ import annotations
 
+import random
 from typing import Any
 
+import pytest
 from tests.kit.loops import plan_of
 
-from dxlrun.control.controllers.claims import claimed_modes, conflicts, conflicts_text
+from dxlrun.control.controllers.claims import (
+    ControllerSnapshot,
+    SwitchStep,
+    claimed_modes,
+    conflicts,
+    conflicts_text,
+)
+from dxlrun.control.controllers.update_order import lowers_first
 from dxlrun.plan.loop_plan import ControllerPlan
 from dxlwire.modes import Mode
 
@@ -63,3 +72,98 @@ def test_a_chained_controller_leaves_the_servo_to_the_one_below():
 def test_a_broadcaster_conflicts_with_no_controller():
     found = conflicts([wants("all", ("a",)), wants("eyes", ("a",), command=())])
     assert (found, conflicts_text(found)) == ((), "")
+
+
+# Steps: what leaves and what enters, among any controllers
+
+
+def claims(name: str, *joints: str, into: tuple[str, ...] = (), exports: bool = False) -> ControllerPlan:
+    return plan_of(name, joints=joints, into=into, reference=("position",) if exports else (), active=False)
+
+
+def graph(draw: random.Random) -> dict[str, ControllerPlan]:
+    """Return controllers of which some are into one that exports all of their joints."""
+    known: dict[str, ControllerPlan] = {}
+    for index in range(draw.randint(3, 8)):
+        lowers = [one for one in known.values() if one.reference]
+        into: tuple[str, ...] = ()
+        joints = draw.sample("abc", draw.randint(1, 3))
+        if lowers and draw.random() < 0.5:
+            lower = draw.choice(lowers)
+            into, joints = (lower.name,), draw.sample(lower.joints, draw.randint(1, len(lower.joints)))
+        known[f"c{index}"] = claims(f"c{index}", *joints, into=into, exports=draw.random() < 0.5)
+    return known
+
+
+def without(active: dict[str, ControllerPlan], leave: tuple[str, ...]) -> dict[str, ControllerPlan]:
+    return {name: one for name, one in active.items() if name not in leave}
+
+
+def test_what_is_active_afterwards_claims_nothing_twice_and_chains_are_whole():
+    for seed in range(300):
+        draw = random.Random(seed)
+        known = graph(draw)
+        active: dict[str, ControllerPlan] = {}
+        for _ in range(12):
+            names = draw.sample(sorted(known), draw.randint(1, 2))
+            step = ControllerSnapshot(known, active).request(names)
+            if not isinstance(step, SwitchStep):
+                needed = [known[name] for name in lowers_first(names, known)]
+                assert conflicts(needed), "only what claims the same is refused"
+                continue
+            assert not set(step.leave) & set(step.enter)
+            entering = [known[name] for name in step.enter]
+            active = without(active, step.leave) | {one.name: one for one in entering}
+            assert set(names) <= active.keys()
+            assert not conflicts(active.values())
+            assert all(lower in active for one in active.values() for lower in one.into)
+            for name in step.leave:  # none leaves that could have stayed
+                lowers = [lower for lower in known[name].into if lower in step.leave]
+                assert lowers or conflicts([known[name], *entering])
+            if draw.random() < 0.3 and active:
+                leaving = ControllerSnapshot(known, active).switch((), [draw.choice(sorted(active))])
+                if isinstance(leaving, SwitchStep):
+                    active = without(active, leaving.leave)
+
+
+ALL = {
+    one.name: one
+    for one in (
+        claims("low", "a", exports=True),
+        claims("high", "a", into=("low",)),
+        claims("other", "a"),
+        claims("rest", "a"),
+        claims("on_low", "a", into=("low",)),
+        claims("twice", "a", "b", into=("low", "mate")),
+        claims("mate", "a", "b", exports=True),
+        claims("stray", "a", into=("gone",)),
+    )
+}
+
+
+def takes_over(fallback: str, active: str = "", waiting: str = "", failed: tuple[str, ...] = ()) -> object:
+    """Return how a fallback takes over for `high`."""
+    engaged = [{name: ALL[name] for name in names.split()} for names in (active, waiting)]
+    return ControllerSnapshot(ALL, *engaged).fall_back(fallback, ["high"], failed)
+
+
+def test_a_fallback_takes_over_from_those_below_the_one_that_failed():
+    assert takes_over("rest", "low", failed=("high",)) == SwitchStep(("low",), ("rest",))
+    assert takes_over("on_low", "low", failed=("high",)) == SwitchStep((), ("on_low",))
+
+
+@pytest.mark.parametrize(
+    ("fallback", "active", "waiting", "failed"),
+    [
+        ("rest", "rest", "", ()),  # it is active already
+        ("rest", "", "rest", ()),  # or will be
+        ("rest", "other", "", ()),  # one that goes on holds its joint
+        ("twice", "low", "", ()),  # what it is into would have to leave
+        ("stray", "", "", ()),  # what it is into was unloaded
+        ("on_low", "", "", ("low",)),  # what it is into has failed
+        ("rest", "", "", ("rest",)),  # it has failed itself
+        ("on_low", "", "low", ()),  # what it is into is not there yet
+    ],
+)
+def test_a_fallback_that_cannot_take_over_is_none(fallback, active, waiting, failed):
+    assert takes_over(fallback, active, waiting, failed) is None

@@ -1,7 +1,6 @@
 """Goals: numbers, results, preemption, cancel, and what ends a goal that its controller does not end."""
 
 import gc
-import re
 import sys
 from dataclasses import replace
 from typing import Annotated, ClassVar
@@ -165,36 +164,6 @@ def test_a_goal_has_a_number_and_a_result(story):
     assert story.done("goal")[:2] == [(1, "move", [3.0]), (2, "move", [1.0])]
 
 
-def test_a_command_that_is_no_goal_goes_on_command_and_has_no_number(story):
-    story.run(4, {2: story.posts("arm", "nudge")})
-    assert story.answer() == Completion(2)
-    assert (story.done("command"), story.statuses) == ([("nudge",)], [])
-
-
-def test_each_goal_takes_the_place_of_the_one_before(story):
-    move = story.moves(50)
-    story.run(5, {1: move, 2: move, 3: [move, move]})
-    ends = ["preempted"] * 3 + ["aborted"]
-    expected = [one for number, end in enumerate(ends, 1) for one in ((number, "accepted"), (number, end))]
-    assert story.statuses == expected
-    assert story.reports[1][1].text == "replaced by goal 2"
-
-
-@pytest.mark.parametrize("which", [{"goal": 1}, {"controller": "arm"}])
-def test_a_cancelled_goal_ends_when_its_controller_is_at_rest(story, which):
-    story.run(8, {1: story.moves(50), 3: story.cancels(**which)})
-    assert story.timed == [(1, "accepted"), (4, "cancelled")]
-    assert story.answer(2) == Completion(3)
-
-
-def test_a_cancel_that_comes_twice_is_refused_with_one_sentence(story):
-    cancel = story.cancels()
-    story.run(8, {1: story.moves(50), 3: [cancel, cancel], 6: cancel})
-    assert story.refused(3) == (Code.CANCELLED_ALREADY, "goal 1 is being cancelled already")
-    assert story.refused(4) == (Code.GOAL_ENDED, "goal 1 has ended already: cancelled")
-    assert story.done("cancel") == [(1,)]
-
-
 def test_a_goal_that_ends_in_the_cycle_of_its_cancel_has_one_result(story):
     story.mover.on_cancel = lambda self, goal, time_ns: None  # it goes on to the goal, reached in this cycle
     story.run(8, {1: story.moves(3), 3: story.cancels(), 4: story.cancels()})
@@ -202,41 +171,11 @@ def test_a_goal_that_ends_in_the_cycle_of_its_cancel_has_one_result(story):
     assert story.refused(3) == (Code.GOAL_ENDED, "goal 1 has ended already: reached")
 
 
-@pytest.mark.parametrize(
-    ("which", "code", "text"),
-    [
-        ({"goal": 7}, Code.UNKNOWN_GOAL, "there is no goal 7; the newest is 1"),
-        ({"goal": -1}, Code.UNKNOWN_GOAL, "there is no goal -1; the newest is 1"),
-        ({"goal": 0}, Code.UNKNOWN_GOAL, "there is no goal 0; the newest is 1"),
-        ({"controller": "head"}, Code.UNKNOWN_CONTROLLER, "there is no controller head"),
-        ({"controller": "arm"}, Code.NO_GOAL, "arm has no goal"),
-    ],
-)
-def test_a_cancel_of_what_there_is_not_is_refused(story, which, code, text):
-    story.run(5, {1: story.moves(1), 3: story.cancels(**which)})
-    assert story.refused(2) == (code, text)
-
-
 def test_deactivation_aborts_the_goal_and_a_result_that_comes_later_counts_no_more(story):
     story.mover.on_deactivate = lambda self, time_ns: self.goal.end(Outcome.REACHED)
     story.run(5, {1: story.moves(50), 3: story.switches((), ["arm"])})
     assert story.timed == [(1, "accepted"), (3, "aborted")]
     assert story.reports[-1][1].text == "arm was deactivated"
-
-
-STEPS = {"goal": "on_goal (move)", "cancel": "on_cancel", "update": "update"}
-
-
-@pytest.mark.parametrize("step", STEPS)
-def test_a_fault_aborts_the_goal_and_the_fallback_takes_over(step):
-    story = Story(fallback="careful")
-    story.script("careful", joints=("j0",), active=False)
-    fails = {2: lambda: story.mover.fail_in.add(step)} if step == "update" else {}
-    story.mover.fail_in |= {step} - {"update"}
-    story.run(6, {1: story.moves(50), 3: story.cancels()} | fails)
-    assert story.statuses == ENDED
-    assert f"raised in {STEPS[step]}: RuntimeError: no way" in story.reports[-1][1].text
-    assert story.active(5) == ["leg", "careful"]
 
 
 @pytest.mark.parametrize("outcome", ["arrived", None, 3])
@@ -271,15 +210,6 @@ def test_a_goal_of_a_joint_that_goes_nowhere_is_aborted(story, torque, row, stat
     assert story.reports[-1][1].joint == ("j0" if status == "aborted" else "")
 
 
-@pytest.mark.parametrize("back", [True, False])
-def test_a_lost_joint_may_come_back_until_its_settling_time_is_over(story, back):
-    at = {2: [story.moves(1), story.torque(Torque.LOST)]} | ({40: story.torque(Torque.ON)} if back else {})
-    story.run(80, at)
-    assert story.timed == [(2, "accepted"), (40, "reached") if back else (52, "aborted")]
-    if not back:
-        assert story.reports[-1][1].text == "after 1.000 s, joint j0 does not answer"
-
-
 def test_a_joint_that_was_lost_settles_from_its_return_on(story):
     at = {
         2: [story.moves(1), story.torque(Torque.LOST)],
@@ -293,20 +223,6 @@ def test_a_joint_that_was_lost_settles_from_its_return_on(story):
 def test_the_end_of_a_run_names_a_lost_joint_of_an_unfinished_goal(story):
     story.run(8, {2: story.moves(50), 4: story.torque(Torque.LOST)})
     assert story.reports[-1][1].text == "joint j0 does not answer; the run ended"
-
-
-def test_a_goal_is_not_streamed(story):
-    story.run(3, {1: story.posts("arm", "move", [5.0], PERIOD_NS)})
-    assert story.refused() == (Code.GOAL_STREAMED, "move of arm is a goal; send it once, not in a stream")
-
-
-def test_a_goal_beside_a_stream_that_runs_out_is_aborted(story):
-    """Its controller is held from then on, so it could not end the goal itself."""
-    stream = story.posts("arm", "nudge", [0.0], 2 * PERIOD_NS)
-    story.run(12, {2: story.moves(100), 3: stream, 9: story.cancels(controller="arm")})
-    assert story.statuses == ENDED
-    assert story.reports[-1][1].text == "the stream of commands ended"
-    assert story.refused(3)[0] is Code.NO_GOAL
 
 
 def test_the_topic_has_feedback_ten_times_a_second_between_acceptance_and_result(story, monkeypatch):
@@ -415,19 +331,6 @@ def test_parameters_that_are_not_live_are_refused_whole(story, values, text):
     assert text in why
     assert story.done("parameters") == []
     assert story.manager._named["arm"].controller.parameters == Speeds()
-
-
-@pytest.mark.parametrize("active", [True, False])
-def test_a_controller_that_raises_in_on_parameters_breaks_its_contract(active):
-    story = Story(fallback="careful", active=active)
-    story.script("careful", joints=("j0",), active=False)
-    story.mover.fail_in = {"parameters"}
-    assert story.run(5, {2: changes(story, {"speed": 2.0})}).reason == "stopped"
-    why = "controller arm raised in on_parameters: RuntimeError: no way"
-    code, text = story.refused()
-    assert code is Code.CONTROLLER_FAULT
-    assert re.fullmatch(rf"{why} \(test_goals\.py:\d+\)", text)
-    assert story.active(4) == (["leg", "careful"] if active else ["leg"])
 
 
 @pytest.mark.parametrize(

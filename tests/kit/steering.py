@@ -1,0 +1,506 @@
+"""Steered robots as text: what clients request at which time, and what must come of it.
+
+Each text in `tests/steering` has a robot file and, behind `====`, stories. A story is a title, changes of the
+robot (`active: false => active: true`), and steps on virtual time:
+
+    A joint that is commanded is not released by mistake
+    at 0.4 s  torque off elbow
+      => refused joint_commanded: elbow is commanded by arm
+      => elbow holds
+    at 0.6 s  torque off elbow release
+      => elbow limp
+      => active none
+
+A line `=>` holds at the end of its step, which is the beginning of the next one; the last step has 0.2 s.
+Requests of a step are separated by `;`, and are done where nothing else is said of them. `ACTIONS` and
+`CHECKS` have all forms. A controller of the type `scripted` commands what is commanded of it, else `own`.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import cache, partial
+from pathlib import Path
+from typing import Annotated, Any, ClassVar
+
+import msgspec
+import numpy as np
+import pytest
+import yaml
+from tests.kit.line_faults import turn_by_hand
+
+import dxlrun
+from dxlrun.channels.answers import Acceptance, Completion, Refusal
+from dxlrun.channels.commands import LOOP, CommandMessage, QueueInbox
+from dxlrun.channels.cycle import LIMP, OFFLINE
+from dxlrun.channels.event_records import Event, EventCode
+from dxlrun.channels.ring import RecordKind
+from dxlrun.compile import robot_compiler
+from dxlrun.control.controllers.plugin_loading import Offer, PlugIns, load_plugins
+from dxlrun.plan.robot_plan import Plan
+from dxlrun.remote.preparation import Preparation, RefusedRequest
+from dxlrun.run import virtual_run
+from dxlrun.testing import VirtualRobot, plan_of
+from dxlsim.servo.simulated_servo import SimulatedServo
+from dxlwire.modes import Mode
+
+STORIES = Path(__file__).parents[1] / "steering"
+LAST_S = 0.2
+
+
+class Go(dxlrun.CommandModel):
+    values: list[float]
+
+
+class ScriptedParameters(dxlrun.ParametersModel):
+    joints: tuple[str, ...] = ()
+    command: tuple[str, ...] = ("position",)
+    exports: tuple[str, ...] = ()
+    takeovers: tuple[str, ...] = ()
+    own: float | None = None
+    speed: Annotated[float, dxlrun.LIVE] = 1.0
+
+
+class Scripted(dxlrun.Controller[ScriptedParameters]):
+    """Commands its own value or what is commanded of it; its goal `move` takes so many updates."""
+
+    Parameters = ScriptedParameters
+    Commands: ClassVar = {"go": Go, "move": Go}
+    Goals: ClassVar = frozenset({"move"})
+    story: ClassVar[Any] = None
+
+    @classmethod
+    def interfaces(cls, parameters: ScriptedParameters, joints: tuple[str, ...]) -> dxlrun.Interfaces:
+        own = parameters
+        return dxlrun.Interfaces(own.joints, own.command, own.exports, takeovers=own.takeovers)
+
+    @classmethod
+    def prepare(cls, kind: str, command: Any, parameters: ScriptedParameters) -> Any:
+        return np.array(command.values)
+
+    def _step(self, step: str) -> None:
+        if self.story is not None:
+            self.story.enter_step(self, step)
+
+    def on_activate(self, time_ns: int) -> None:
+        self.goal, self.left, self.own = None, 0, self.parameters.own
+        self._step("activate")
+
+    def on_deactivate(self, time_ns: int) -> None:
+        self._step("deactivate")
+
+    def on_parameters(self, time_ns: int) -> None:
+        self._step("parameters")
+
+    def on_command(self, kind: str, data: Any, time_ns: int) -> None:
+        self._step("command")
+        self.own = float(data[0]) if len(data) else self.own
+
+    def on_goal(self, goal: Any, data: Any, time_ns: int) -> None:
+        self.goal, self.left = goal, int(data[0])
+        self._step("goal")
+
+    def on_cancel(self, goal: Any, time_ns: int) -> None:
+        self.left = -2  # it comes to rest two updates later
+        self._step("cancel")
+
+    def update(self, time_ns: int, period_ns: int) -> None:
+        self._step("update")
+        for interface in self.parameters.command:
+            given = getattr(self.context.references, interface)
+            commands = getattr(self.context.commands, interface)
+            if np.isfinite(given).any():
+                np.copyto(commands, given, where=np.isfinite(given))
+            elif self.own is not None:
+                commands[:] = self.own
+        if self.goal is not None:
+            self.left += 1 if self.left < 0 else -1
+            if self.left in (0, -1):
+                self.goal.end(dxlrun.Outcome.REACHED if self.left == 0 else dxlrun.Outcome.CANCELLED)
+                self.goal = None
+
+
+@dataclass
+class Step:
+    """Actions at a time, and the lines of what holds at the end; `line` is that of the file."""
+
+    at_s: float
+    actions: list[str]
+    line: int
+    checks: list[tuple[int, str]] = field(default_factory=list)
+
+
+@dataclass
+class Story(QueueInbox):
+    """A case of a text: runs its robot, and checks each step."""
+
+    file: str
+    title: str
+    robot_text: str
+    steps: list[Step]
+
+    def check(self, folder: Path) -> None:
+        """Run the story; raise AssertionError with file, line and what was found."""
+        QueueInbox.__init__(self)
+        self.coming, self.step = list(self.steps), Step(-1.0, [], 0)
+        self.events: list[str] = []
+        self.calls: list[str] = []
+        self.sets: list[list[str]] = []
+        self.asked: list[int] = []
+        self.later: list[int] = []  # requests that wait
+        self.taken: dict[str, Any] = {}
+        self.breaks: dict[tuple[str, str], Callable[[Any], None]] = {}
+        self.count, self.ending, self.result = 0, False, None
+        with pytest.MonkeyPatch.context() as patch:
+            plan = compile_story(self.robot_text, folder)
+            own = type("OwnScripted", (Scripted,), {"story": self})
+            self.plugins = with_scripted(own)
+            patch.setattr(virtual_run, "load_plugins", lambda **_: self.plugins)
+            self.robot = VirtualRobot(plan, inbox=self, watch=self.see)
+        self.plan = plan
+        self.rows = {joint.name: row for row, joint in enumerate(plan.loop.joints)}
+        self.servos: dict[str, tuple[SimulatedServo, Any]] = {
+            servo.joint: (bus.servo(servo.servo_id), servo)
+            for bus, planned in zip(self.robot.buses, plan.buses, strict=True)
+            for servo in planned.servos
+        }
+        self.torque_given: list[str] = []
+        for name, (servo, _) in self.servos.items():
+            servo.registers.watch_items(("torque_enable",), partial(self.see_torque, name, servo))
+        self.result = self.robot.run()
+        self.end_step()
+        assert not self.coming, f"{self.file}:{self.coming[0].line}: the run ended before: {self.result}"
+
+    # While it runs
+
+    def drain_commands(self) -> Any:
+        """Begin the steps that are due; called in each cycle."""
+        now_s = self.robot.record.cycle * self.plan.loop.period_ns * 1e-9 + 1e-6
+        if not self.coming and now_s >= self.step.at_s + LAST_S:
+            self.robot.stop.request()
+            self.ending = True
+        while self.coming and now_s >= self.coming[0].at_s:
+            self.end_step()
+            self.step = self.coming.pop(0)
+            for kept in (self.events, self.calls, self.asked, self.torque_given):
+                kept.clear()
+            self.sets = self.sets[-1:]
+            for action in self.step.actions:
+                self.act(action)
+        return super().drain_commands()
+
+    def see(self, kind: RecordKind, payload: Any) -> None:
+        """Keep an event, or what is active in a cycle."""
+        if kind == RecordKind.TAGGED:
+            with suppress(msgspec.ValidationError):
+                event = msgspec.msgpack.decode(payload, type=Event)
+                self.events.append(f"{EventCode(event.code).name.lower()} {event.source}: {event.text}")
+        elif kind == RecordKind.CYCLE:
+            self.taken = self.snapshot()
+            if self.sets[-1:] != [self.taken["active"]]:
+                self.sets.append(self.taken["active"])
+
+    def see_torque(self, name: str, servo: SimulatedServo) -> None:
+        if servo.registers["torque_enable"]:
+            self.torque_given.append(name)
+
+    def snapshot(self) -> dict[str, Any]:
+        record, states = self.robot.record, self.robot.record.states
+        plans = self.robot.robot.manager.plans
+        arrays = {"commands": record.commands.values, "reference": record.reference, "torque": states.torque}
+        arrays |= {"position": states.position, "mode": states.mode}
+        found: dict[str, Any] = {name: array.copy() for name, array in arrays.items()}
+        found["on"] = {name: servo.torque_on for name, (servo, _) in self.servos.items()}
+        found["active"] = [plan.name for bit, plan in enumerate(plans) if record.active >> bit & 1]
+        return found
+
+    def enter_step(self, controller: Scripted, step: str) -> None:
+        """Keep a call of a scripted controller, and do what a line asked for at this call."""
+        name = controller.context.name
+        if step != "update" and not self.ending:
+            self.calls.append(f"{step} {name}")
+        if act := self.breaks.pop((name, step), None):
+            act(controller)
+
+    # Actions
+
+    def act(self, text: str) -> None:
+        for pattern, act in ACTIONS.items():
+            if found := re.fullmatch(pattern, text):
+                act(self, *found.groups())
+                return
+        raise AssertionError(f"{self.file}:{self.step.line}: no action: {text}")
+
+    def ask(self, kind: str, /, of: str = LOOP, lease_ns: int = 0, **data: Any) -> None:
+        """Put a request for the loop into the inbox, or the command of a controller."""
+        self.count += 1
+        self.asked.append(self.count)
+        try:
+            raw = json.dumps(data).encode() if data else b""
+            if of != LOOP:
+                raw = self.prepared(of, kind, raw or b"{}")
+        except RefusedRequest as error:
+            self.answers[self.count] = error.refusal
+        else:
+            self.waiting.append(CommandMessage(self.count, of, kind, raw, "anna", lease_ns))
+
+    def prepared(self, controller: str, kind: str, body: bytes) -> bytes:
+        """Return a command as the gateway hands it over; nothing where there is no such controller."""
+        plans = {plan.name: plan for plan in self.robot.robot.manager.plans}
+        preparation = Preparation({joint.name: joint for joint in self.plan.loop.joints}, self.plugins)
+        return preparation.command(plans[controller], kind, body).data if controller in plans else b""
+
+    def load(self, name: str, entry: str) -> None:
+        keys = yaml.safe_load(entry)
+        plan = self.plan.loop.controllers[0]
+        usual = {"distribution": "tests 1", "publishes": (), "active": False, "every": 1}
+        own = {"joints": keys.pop("joints", plan.joints), "command": keys.pop("command", ["position"])}
+        fields = {
+            key: keys.pop(key) for key in ("into", "reference", "fallback", "rate", "reads") if key in keys
+        }
+        parameters = json.dumps({**own, "exports": fields.get("reference", []), **keys})
+        self.ask("load", name=name, type="scripted", parameters=parameters, **usual, **own, **fields)
+
+    def turn(self, joint: str, position: str) -> None:
+        servo, planned = self.servos[joint]
+        turn_by_hand(servo, planned.direction * float(position) + planned.reference)
+
+    def stick(self, joint: str, item: str, value: str) -> None:
+        """Let an item of a servo keep a value, whatever is written."""
+        servo = self.servos[joint][0]
+        servo.registers.watch_items((item,), lambda: servo.poke(item, int(value)))
+
+    # Checks
+
+    def end_step(self) -> None:
+        """Check the lines of the step that ends."""
+        answers = [self.answers.get(number) for number in self.asked]
+        self.unnamed = list(zip(self.asked, answers, strict=True))
+        for line, text in self.step.checks:
+            for pattern, check in CHECKS.items():
+                if found := re.fullmatch(pattern, text):
+                    what = check(self, *found.groups())
+                    assert what is None, f"{self.file}:{line}: {text}\n  found: {what}\n  {self.told}"
+                    break
+            else:
+                raise AssertionError(f"{self.file}:{line}: no check: {text}")
+        for _, answer in self.unnamed:
+            done = isinstance(answer, Completion)
+            assert done, f"{self.file}:{self.step.line}: not done: {answer}\n  {self.told}"
+
+    @property
+    def told(self) -> str:
+        """Return what happened in the step."""
+        return "\n  ".join([*map(str, (self.sets, self.answers, self.result)), *self.calls, *self.events])
+
+    def answer(self, earlier: str | None) -> Any:
+        """Return the answer to the next request of the step, or to the oldest one that waited."""
+        number = self.later.pop(0) if earlier else self.unnamed.pop(0)[0]
+        return number, self.answers.get(number)
+
+    def refused(self, earlier: str | None, code: str, text: str | None) -> object:
+        _, found = self.answer(earlier)
+        fits = isinstance(found, Refusal) and found.code == code and (text or "") in found.text
+        return None if fits else found
+
+    def done(self, earlier: str | None, text: str | None) -> object:
+        _, found = self.answer(earlier)
+        return None if isinstance(found, Completion) and (text or "") in repr(found) else repr(found)
+
+    def waits(self) -> object:
+        number, found = self.answer(None)
+        self.later.append(number)
+        return None if found is None or isinstance(found, Acceptance) else found
+
+    def active(self, text: str) -> object:
+        wanted = [[] if one == "none" else one.split() for one in text.split(", then ")]
+        found = self.sets if len(wanted) > 1 else self.sets[-1:]
+        return None if found == wanted else found
+
+    def ordered(self, step: str, names: str) -> object:
+        found = [call.split()[1] for call in self.calls if call.split()[0] == step]
+        return None if found == ([] if names == "none" else names.split()) else found
+
+    def torque(self, joint: str, state: str) -> object:
+        torque, on = self.taken["torque"][self.rows[joint]], self.taken["on"][joint]
+        is_limp, is_lost = torque in LIMP, torque in OFFLINE
+        fits = {"limp": is_limp and not on, "lost": is_lost, "holds": on and not is_limp and not is_lost}
+        return None if fits[state] else f"torque {torque}, the servo has torque: {on}"
+
+    def command(self, joint: str, value: str) -> object:
+        found = self.taken["commands"][:, self.rows[joint]]
+        found = found[np.isfinite(found)].tolist()
+        wanted = [] if value == "nothing" else [float(value)]
+        return None if found == pytest.approx(wanted) else found
+
+    def is_near(self, found: float, value: str, tolerance: float = 1e-9) -> object:
+        return None if found == pytest.approx(float(value), abs=tolerance, nan_ok=True) else found
+
+    def reference(self, name: str, value: str) -> object:
+        place = self.robot.record.layout.references.index(name)
+        return self.is_near(float(self.taken["reference"][place]), value.replace("nothing", "nan"))
+
+    def mode(self, joint: str, name: str) -> object:
+        found = Mode(int(self.taken["mode"][self.rows[joint]])).name.lower()
+        return None if found == name.replace(" ", "_") else found
+
+    def event(self, no: str | None, text: str) -> object:
+        found = [event for event in self.events if text in event]
+        return None if bool(found) == (not no) else found
+
+    def ended(self, reason: str, text: str | None) -> object:
+        fits = self.result is not None and self.result.reason == reason and (text or "") in self.result.detail
+        return None if fits else self.result
+
+
+def breaking(story: Story, name: str, step: str | None) -> None:
+    """Let a scripted controller raise at its next step."""
+
+    def fail(controller: Scripted) -> None:
+        raise RuntimeError("broken")
+
+    story.breaks[name, step or "update"] = fail
+
+
+def requesting(act: str) -> Callable[..., None]:
+    """Return the action in which a scripted controller asks the runtime for something in its next update."""
+
+    def request(story: Story, name: str, *words: str) -> None:
+        def do(controller: Scripted) -> None:
+            if act == "take_over":
+                controller.context.take_over(words[0].split(), words[1])
+            elif act == "end_run":
+                controller.context.end_run(words[0])
+            else:
+                controller.own = float(words[0])
+
+        story.breaks[name, "update"] = do
+
+    return request
+
+
+def switch(story: Story, activate: str | None, deactivate: str | None) -> None:
+    story.ask("switch", activate=(activate or "").split(), deactivate=(deactivate or "").split())
+
+
+def servo_action(name: str, *values: Any) -> Callable[[Story, str], None]:
+    return lambda story, joint: getattr(story.servos[joint][0], name)(*values)
+
+
+def command(story: Story, controller: str, kind: str, data: str, seconds: str | None) -> None:
+    story.ask(kind, controller, round(float(seconds or 0) * 1e9), **yaml.safe_load(data or "{}"))
+
+
+ACTIONS: dict[str, Callable[..., None]] = {
+    r"(?:activate (.+?))?(?:, )?(?:deactivate (.+))?": switch,
+    r"torque (on|off) (.+?)( release)?": lambda story, on, joints, release: story.ask(
+        "torque", joints=joints.split(), on=on == "on", release=bool(release)
+    ),
+    r"reboot (.+?)( release)?": lambda story, joints, release: story.ask(
+        "reboot", joints=joints.split(), release=bool(release)
+    ),
+    r"rate (\S+) Hz": lambda story, rate: story.ask("rate", rate=float(rate)),
+    r"(pause|resume|halt|stop)": lambda story, kind: story.ask(kind),
+    r"cancel goal (-?\d+)": lambda story, goal: story.ask("cancel", goal=int(goal)),
+    r"cancel (\w+)": lambda story, name: story.ask("cancel", controller=name),
+    r"load (\w+) (\{.*\})": Story.load,
+    r"unload (\w+)": lambda story, name: story.ask("unload", controller=name),
+    r"ask (\w+) (\{.*\})": lambda story, kind, data: story.ask(kind, **yaml.safe_load(data)),
+    r"parameters (\w+) (\{.*\})": lambda story, name, values: story.ask(
+        "parameters", controller=name, values=yaml.safe_load(values)
+    ),
+    r"send (\w+) (\w+)(?: (\{.*\}))?(?: for (\S+) s)?": command,
+    r"(\w+) breaks(?: in (\w+))?": breaking,
+    r"(\w+) requests (.+?): (.+)": requesting("take_over"),
+    r"(\w+) ends the run: (.+)": requesting("end_run"),
+    r"(\w+) commands (\S+)": requesting("command"),
+    r"hand (\w+) to (\S+)": Story.turn,
+    r"stick (\w+) (\w+) (\d+)": Story.stick,
+    r"silence (\w+)": servo_action("silence"),
+    r"answer (\w+)": servo_action("silence", False),
+    r"overload (\w+)": servo_action("trigger_overload"),
+    r"power cycle (\w+)": servo_action("power_cycle"),
+    r"poke (\w+) (\w+) (\d+)": lambda story, joint, item, value: story.servos[joint][0].poke(
+        item, int(value)
+    ),
+}
+"""Actions of a step."""
+
+CHECKS: dict[str, Callable[..., object]] = {
+    r"(then )?refused (\w+)(?:: (.+))?": Story.refused,
+    r"(then )?done(?: (.+))?": Story.done,
+    r"waits": Story.waits,
+    r"active (.+)": Story.active,
+    r"(activate|deactivate|command|goal|cancel|parameters) called: (.+)": Story.ordered,
+    r"(\w+) (limp|holds|lost)": Story.torque,
+    r"(\w+) got no torque": lambda story, name: name in story.torque_given or None,
+    r"(\w+) commanded (\S+)": Story.command,
+    r"(\w+) at (\S+)": lambda story, name, value: story.is_near(
+        float(story.taken["position"][story.rows[name]]), value, 0.02
+    ),
+    r"(\S+) referenced (\S+)": Story.reference,
+    r"(\w+) in (.+) mode": Story.mode,
+    r"(no )?event (.+)": Story.event,
+    r"run (ended|stopped|fault)(?:: (.+))?": Story.ended,
+}
+"""Lines that say what holds; each returns what was found instead, or None."""
+
+
+@cache
+def plain_plugins() -> PlugIns:
+    return load_plugins()
+
+
+def with_scripted(controller: type[Scripted]) -> PlugIns:
+    """Return the installed plug-ins and the type `scripted`."""
+    offers = {**plain_plugins().controllers, "scripted": Offer("scripted", controller, "tests 1")}
+    return PlugIns(offers, {}, drivers=plain_plugins().drivers)
+
+
+PLANS: dict[str, Plan] = {}
+
+
+def compile_story(text: str, folder: Path) -> Plan:
+    """Compile a robot once for all of its stories."""
+    if text not in PLANS:
+        (folder / "robot.yaml").write_text(text)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(robot_compiler, "load_plugins", lambda **_: with_scripted(Scripted))
+            PLANS[text] = plan_of(folder / "robot.yaml")
+    return PLANS[text]
+
+
+def stories(path: Path) -> Iterator[Story]:
+    """Yield the stories of a text."""
+    whole = path.read_text("utf-8")
+    robot = whole.partition("====\n")[0]
+    story: Story | None = None
+    first = robot.count("\n") + 1
+    for number, line in enumerate(whole.splitlines()[first:], first + 1):
+        if not line.strip():
+            if story is not None:
+                yield story
+            story = None
+        elif line.startswith("#"):
+            continue
+        elif story is None:
+            story = Story(path.name, line.strip(), robot, [])
+        elif found := re.fullmatch(r"at (\S+) s *(.*)", line):
+            actions = found[2].split("; ") if found[2] else []
+            story.steps.append(Step(float(found[1]), actions, number))
+        elif line.strip().startswith("=> "):
+            story.steps[-1].checks.append((number, line.strip()[3:]))
+        else:
+            right, _, wrong = line.replace("\\n", "\n").partition(" => ")
+            assert right in story.robot_text or right.startswith("+ "), f"{path.name}:{number}: {right}"
+            story.robot_text = (
+                f"{story.robot_text}{right[2:]}\n"
+                if right.startswith("+ ")
+                else story.robot_text.replace(right, wrong, 1)
+            )
+    if story is not None:
+        yield story
