@@ -73,16 +73,26 @@ def test_changed_files_run_their_long_tests_in_every_process(run, tmp_path: Path
     assert run("-n", workers, "--changed=changed.txt")[-1].startswith("2 passed")
 
 
-@pytest.mark.parametrize(("reason", "code"), [("moto[server,s3]", 0), ("it is Sunday", 1)])
-def test_other_skip_than_those_allowed_fails_the_run(run, tmp_path: Path, reason: str, code: int) -> None:
+@pytest.mark.parametrize(
+    ("words", "reason", "code"),
+    [
+        ((), "moto[server,s3]", 0),
+        (("--all",), "moto[server,s3]", 1),
+        (("--all",), "no IPv6", 0),
+        ((), "it is Sunday", 1),
+    ],
+)
+def test_other_skip_than_those_allowed_fails_the_run(
+    run, tmp_path: Path, words: tuple[str, ...], reason: str, code: int
+) -> None:
     (tmp_path / "test_short.py").write_text(f"import pytest\ndef test_skip():\n    pytest.skip({reason!r})\n")
     for workers in ("0", "2"):
         run("-n", workers)
-        lines = run("-n", workers, "--strict-skips", code=code)
+        lines = run("-n", workers, "--strict-skips", *words, code=code)
         assert any("not allowed to skip: test_short.py::test_skip" in line for line in lines) == bool(code)
 
 
-@pytest.mark.parametrize("pattern", skips.ALLOWED)
+@pytest.mark.parametrize("pattern", [*skips.ALLOWED, *skips.ALLOWED_BUT_FOR_ALL])
 def test_allowed_skip_is_one_of_the_tests(pattern: str) -> None:
     source = "".join(
         path.read_text("utf-8") for path in ROOT.glob("tests/**/*.py") if path.name != "skips.py"

@@ -102,9 +102,7 @@ class Scene:
 def test_poses_of_logged_frames_are_those_of_pinocchio(
     path: Path, amount: float, chance: random.Random
 ) -> None:
-    pin = pytest.importorskip(
-        "pinocchio", reason="pin has 380 MB, so CI does not install it: pip install pin"
-    )
+    pin = pytest.importorskip("pinocchio", reason="pin has 380 MB, so only the extra `full` has it")
     urdf = read_urdf(path.read_text())
     model = pin.buildModelFromXML(path.read_text(), mimic=True)
     data = model.createData()

@@ -101,9 +101,7 @@ def judged_by_the_log(robot: Robot, received: list[Mapping[str, Any]]) -> None:
 @campaign(ci=30, night=250, release=1000)
 @pytest.mark.timeout(150)
 def test_frames_equal_those_of_pinocchio(empty: Place, amount: float, chance: random.Random) -> None:
-    pin = pytest.importorskip(
-        "pinocchio", reason="pin has 380 MB, so CI does not install it: pip install pin"
-    )
+    pin = pytest.importorskip("pinocchio", reason="pin has 380 MB, so only the extra `full` has it")
     model = pin.buildModelFromUrdf(str(ROBOTS / "urdf/bioloid_torso.urdf"))
     data = model.createData()
     robot, foreign = empty.robot("bioloid_torso"), empty.foreign()

@@ -53,9 +53,7 @@ def test_no_robot_with_a_urdf_is_left_out() -> None:
 @campaign(ci=10, night=200, release=1000)
 @pytest.mark.parametrize("text", [text for _, text in texts()], ids=[name for name, _ in texts()])
 def test_poses_of_frames_are_those_of_pinocchio(text: str, amount: float, chance: random.Random) -> None:
-    pin = pytest.importorskip(
-        "pinocchio", reason="pin has 380 MB, so CI does not install it: pip install pin"
-    )
+    pin = pytest.importorskip("pinocchio", reason="pin has 380 MB, so only the extra `full` has it")
     urdf = read_urdf(text)
     tree = FrameTree(urdf, ())
     model = pin.buildModelFromXML(text, mimic=True)

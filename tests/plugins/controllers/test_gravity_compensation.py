@@ -48,9 +48,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 
 def test_the_law_is_pinocchios() -> None:
-    pin = pytest.importorskip(
-        "pinocchio", reason="pin has 380 MB, so CI does not install it: pip install pin"
-    )
+    pin = pytest.importorskip("pinocchio", reason="pin has 380 MB, so only the extra `full` has it")
     names = ["finger", "b", "a"]  # `rest` is in no robot file: it stays at 0
     law = gravity_law(URDF, names, 3, ("tip", (0.01, 0.02, -0.03)))
     model = pin.buildModelFromXML(URDF)
