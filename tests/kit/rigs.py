@@ -22,6 +22,7 @@ from random import Random
 from typing import Any
 
 import numpy as np
+import pytest
 from msgspec.structs import replace
 from numpy.typing import NDArray
 from tests.kit.decoded import decode_packets
@@ -34,6 +35,7 @@ from dxlrun.channels.logged_packets import LoggedPacket, PacketBatch
 from dxlrun.channels.ring import Handover
 from dxlrun.dynamixel.bus_part import FeatureParts
 from dxlrun.dynamixel.dynamixel_hardware import DynamixelHardware, ServoArrays
+from dxlrun.errors import StartUpError
 from dxlrun.features import FEATURES
 from dxlrun.features.devices.plan import decode_devices
 from dxlsim.bus.ledger import Ledger
@@ -129,6 +131,13 @@ class Rig:
         if given.any() and self.anchors:
             np.copyto(self.goals.position, self.states.position, where=given)
             self.hardware.follow_goals(np.flatnonzero(given).tolist())
+
+    def refused(self) -> tuple[str, ...]:
+        """Start, which must fail; return what is said. No servo has torque then."""
+        with pytest.raises(StartUpError) as caught:
+            self.hardware.start()
+        assert not any(self.torque())
+        return caught.value.sentences
 
     def cycles(self, count: int) -> None:
         for _ in range(count):

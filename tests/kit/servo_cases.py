@@ -1,0 +1,359 @@
+"""Cases of servos as text: what is different about them, what happens, and what the runtime does about it.
+
+A file in `tests/dynamixel/cases` has cases that are separated by blank lines. A case has a title, indented
+steps, and lines that begin with `=>`:
+
+    a servo that lost its power returns without torque
+      servos: XM430-W350 11 12, watchdog 10
+      servo 11: position_p_gain 700
+      3 cycles
+      servo 12: power cut for 0.3 s
+      100 cycles
+    => servo rebooted arm_12_joint: ...
+    => torque: 11
+
+The tables at the end of this file have all steps. The robot starts before the first `=>`, at the step
+`start`, or before the first step that needs a robot that has started. Each event that is not routine, each
+refusal and each answer has its line, in order; `...` stands for any text, and `HELP` for the page "It does
+not work".
+
+After a start all servos have torque, and each got a goal before. After a refused start no servo has torque
+that had none before, and nothing was written, or a line says that torque was switched off, or what was
+written. The ledger of the simulated bus and the simulated servos are the judges.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from msgspec.structs import replace
+from tests.kit.line_faults import corrupt_next, delay_next, truncate_next, turn_by_hand
+from tests.kit.plans import make_plan
+from tests.kit.rigs import Rig, every_servo, make_rig, make_x
+
+from dxlrun.errors import StartUpError, help_link
+from dxlsim.servo.simulated_servo import SimulatedServo
+from dxlsim.simulation_plan import ServoConfig
+from dxlwire.bus_plan import BusPlan, RegisterValue
+from dxlwire.control_table import find_table
+from dxlwire.modes import Mode
+
+CASES = Path(__file__).parents[1] / "dynamixel" / "cases"
+HELP = help_link("")
+ROUTINE = ("setup ", "torque on ", "torque off ", "read lost ", "read back ", "answered")
+"""How reports begin that a case may leave out."""
+
+
+@dataclass
+class Case:
+    """One case: its file, title and numbered lines, and what came of it."""
+
+    place: str
+    title: str
+    lines: list[tuple[int, str]]
+    plan: BusPlan = field(default_factory=make_plan)
+    options: dict[str, Any] = field(default_factory=dict)
+    _rig: Rig | None = None
+    said: list[str] = field(default_factory=list)
+    events: int = 0
+    """Events that are in `said`, or were."""
+    refused: bool | None = None
+    """None before the start."""
+
+    def check(self) -> None:
+        """Run the case to its end; an error names the file and the line."""
+        for number, line in self.lines:
+            try:
+                self.follow(line)
+            except Exception as error:
+                rest = "".join(f"\n=> {one}" for one in self.reports())
+                raise AssertionError(f"{self.place}:{number}: {line.strip()}: {error}{rest}") from error
+        self.begin()
+        more = [report for report in self.reports() if not report.startswith(ROUTINE)]
+        assert not more, "\n".join([f"{self.place}:{self.lines[-1][0]}: more was reported:", *more])
+        if self.refused and not any("torque" in line and " off " in line for _, line in self.lines):
+            assert not self.rig.writes() or self.has("=> writes"), f"{self.title}: a refused start wrote"
+
+    def has(self, beginning: str) -> bool:
+        return any(line.startswith(beginning) for _, line in self.lines)
+
+    @property
+    def rig(self) -> Rig:
+        if self._rig is None:
+            self._rig = make_rig(self.plan, **self.options)
+        return self._rig
+
+    @property
+    def ids(self) -> list[int]:
+        return [servo.servo_id for servo in self.plan.servos]
+
+    def row(self, servo_id: str) -> int:
+        return self.ids.index(int(servo_id))
+
+    def follow(self, line: str) -> None:
+        """Do a step, or check an expectation."""
+        if not line.startswith("=>"):
+            do_one(STEPS, line.strip(), self)
+            return
+        self.begin()
+        if not do_one(EXPECTATIONS, line[2:].strip(), self, optional=True):
+            self.expect_report(line[2:].strip())
+
+    def begin(self) -> None:
+        """Start the robot, once."""
+        if self.refused is not None:
+            return
+        rig, self.refused = self.rig, False
+        before = rig.torque()
+        try:
+            rig.hardware.start()
+        except StartUpError as error:
+            self.refused = True
+            self.said += [f"refused: {sentence.replace(HELP, 'HELP ')}" for sentence in error.sentences]
+            given = [now and not then for now, then in zip(rig.torque(), before, strict=True)]
+            assert not any(given) or "torque off was sent" in self.said[-1], "a servo has torque"
+            return
+        torque = rig.torque()[: len(self.ids)]
+        assert all(torque) or self.has("=> torque"), f"torque after the start: {torque}"
+        goals = {one.address for servo in self.plan.servos for mode in servo.modes for one in mode.goals}
+        with_goal = set[int]()
+        for servo_id, address, data in rig.writes():
+            if address in goals:
+                with_goal.add(servo_id)
+            is_torque = address == self.plan.servos[0].torque_address and data == b"\1"
+            assert not is_torque or servo_id in with_goal, f"servo {servo_id} got torque before a goal"
+
+    def reports(self) -> list[str]:
+        """Return what was reported and not expected yet."""
+        if self._rig is not None:
+            new = self._rig.events.list[self.events :]
+            self.events += len(new)
+            for code, _, source, text in new:
+                name = code.name.lower().replace("_", " ")
+                self.said.append(f"{name} {source}: {text.replace(HELP, 'HELP ')}")
+        return self.said
+
+    def expect_report(self, line: str) -> None:
+        """Take the next report, which must be this one; routine ones may come before it."""
+        pattern = ".*".join(re.escape(one) for one in line.split("..."))
+        reports = self.reports()
+        while reports:
+            if re.fullmatch(pattern, reports[0], re.DOTALL):
+                reports.pop(0)
+                return
+            assert reports[0].startswith(ROUTINE), "this was not reported, but:"
+            reports.pop(0)
+        raise AssertionError("this was not reported")
+
+    def answer(self, problem: str, _found: int | None = None) -> None:
+        self.said.append(f"answered: {problem}" if problem else "answered")
+
+    # Steps
+
+    def plan_servos(self, model: str, ids: str, options: str | None) -> None:
+        protocol = 1.0 if model[:2] in {"AX", "MX", "RX", "EX"} else 2.0
+        make = partial(make_plan, protocol=protocol) if protocol == 1.0 else make_x
+        given: dict[str, Any] = {"model": model}
+        later: list[Callable[[BusPlan], BusPlan]] = []
+        for option in (options or "").split(", "):
+            name, _, value = option.rpartition(" ")
+            if name == "watchdog":
+                later.append(partial(replace, watchdog_ticks=int(value)))
+            elif name == "port":
+                later.append(partial(replace, port=value))
+            elif option == "torque on return":
+                later.append(partial(every_servo, torque_on_return=True))
+            elif option == "taken over":
+                self.options["take_over"] = True
+            elif name in {"firmware", "position"}:
+                self.options[name] = float(value) if name == "position" else int(value)
+            elif option == "continuous":
+                given |= {"continuous": True, "lower": -math.inf, "upper": math.inf}
+            elif name == "starts in":
+                given["start_mode"] = Mode[value.upper()]
+            elif option:
+                lower, upper = option.removeprefix("limits ").split()
+                given |= {"lower": float(lower), "upper": float(upper)}
+        self.plan = make([int(one) for one in ids.split()], **given)
+        for change in later:
+            self.plan = change(self.plan)
+
+    def declare(self, servo_id: str, registers: str) -> None:
+        """Declare registers of a servo in the robot file, EEPROM first."""
+        servos = list(self.plan.servos)
+        servo = servos[self.row(servo_id)]
+        items = find_table(servo.model, self.plan.protocol).items
+        wanted = []
+        for name, value in (one.split() for one in registers.split(", ")):
+            item = items[name]
+            wanted.append(RegisterValue(item.address, item.size, int(value), name, item.area == "EEPROM"))
+        servos[self.row(servo_id)] = replace(
+            servo, settings=tuple(sorted(wanted, key=lambda one: not one.eeprom))
+        )
+        self.plan = replace(self.plan, servos=tuple(servos))
+
+    def change_servo(self, servo_id: str, changes: str) -> None:
+        for change in changes.split(", "):
+            do_one(CHANGES, change, self, self.rig.servo(int(servo_id)))
+
+    def act_before(
+        self, packet: Sequence[str], value: str | None, first: str | None, last: str, step: str
+    ) -> None:
+        """Do something before each packet that reads or writes an address of a servo, or only some times."""
+        least, most = int(first or 1), int(last) if last else math.inf
+        count = 0
+
+        def act() -> None:
+            nonlocal count
+            count += 1
+            if least <= count <= most:
+                do_one(STEPS, step, self)
+
+        data = b"" if value is None else bytes((int(value),))
+        self.rig.when(partial(is_packet, self.plan.protocol, packet, data), act)
+
+    def change_mode(self, servo_id: str, mode: str) -> None:
+        modes = [0] * len(self.ids)
+        modes[self.row(servo_id)] = Mode[mode.upper()]
+        self.rig.set_modes(*modes)
+
+    def stop(self) -> None:
+        self.said += [f"stopped: {sentence}" for sentence in self.rig.hardware.stop()]
+
+    # Expectations
+
+    def expect_ids(self, found: Sequence[int], ids: str) -> None:
+        named = {"all": self.ids, "none": []}
+        expected = named[ids] if ids in named else [int(one) for one in ids.split()]
+        assert [*found] == expected, f"it is {' '.join(map(str, found)) or 'none'}"
+
+    def expect_flags(self, flags: Sequence[bool], ids: str) -> None:
+        self.expect_ids([one for one, flag in zip(self.ids, flags, strict=False) if flag], ids)
+
+    def expect_registers(self, servo_id: str, registers: str) -> None:
+        for name, value in (one.split() for one in registers.split(", ")):
+            found = self.rig.servo(int(servo_id)).registers.ticks(name)
+            assert found == int(value), f"{name} is {found}"
+
+    def expect_mode(self, servo_id: str, mode: str) -> None:
+        found = Mode(int(self.rig.states.mode[self.row(servo_id)])).name.lower()
+        assert found == mode, f"it is {found}"
+
+
+def is_packet(protocol: float, packet: Sequence[str], value: bytes, data: bytes) -> bool:
+    """Check whether bytes are an instruction (`read` or `write`) to an ID and an address, with this value."""
+    kind, servo_id, address = packet
+    expected = int(servo_id), {"read": 2, "write": 3}[kind], int(address)
+    if protocol == 1.0:
+        return (data[2], data[4], data[5]) == expected and data[6:-1].startswith(value)
+    return (data[4], data[7], data[8] | data[9] << 8) == expected and data[10:-2].startswith(value)
+
+
+def turn_beyond(case: Case, servo: SimulatedServo, ticks: str, side: str) -> None:
+    plan = case.plan.servos[case.row(str(servo.servo_id))]
+    tick = plan.upper_tick + int(ticks) if side == "above" else plan.lower_tick - int(ticks)
+    turn_by_hand(servo, tick * plan.rad_per_tick)
+
+
+def poke(_case: Case, servo: SimulatedServo, name: str, value: str) -> None:
+    assert name in servo.registers.table.items, "no such change or register"
+    servo.poke(name, int(value))
+
+
+def do_one(
+    table: dict[str, Callable[..., object]], text: str, case: Case, *more: object, optional: bool = False
+) -> bool:
+    """Call the function of the first pattern that a text fits; return whether there is one."""
+    for pattern, act in table.items():
+        if found := re.fullmatch(pattern, text):
+            if pattern in AFTER_START and table is STEPS:
+                case.begin()
+            act(case, *more, *found.groups())
+            return True
+    assert optional, "no such step"
+    return False
+
+
+SETUP: dict[str, Callable[..., object]] = {
+    r"servos: (\S+) ([\d ]+)(?:, (.+))?": Case.plan_servos,
+    r"declared (\d+): (.+)": Case.declare,
+    r"another: (\S+) (\d+)": lambda case, model, servo_id: case.options.update(
+        extra=(ServoConfig(int(servo_id), model, 0.7, 440_000),)
+    ),
+    r"servo (\d+): (.+)": Case.change_servo,
+    # `before write 13 64 = 1 times 2-4: ...`: torque on of servo 13, for the second to fourth time
+    r"before (read|write) (\d+) (\d+)(?: = (\d+))?(?: times (\d+)-(\d*))?: (.+)": (
+        lambda case, *found: case.act_before(found[:3], *found[3:])
+    ),
+    r"bus echoes": lambda case: setattr(case.rig.buses[0], "echo", True),
+    r"start": Case.begin,
+}
+AFTER_START: dict[str, Callable[..., object]] = {
+    r"(\d+) cycles?": lambda case, count: case.rig.cycles(int(count)),
+    r"without the loop for (\S+) s": lambda case, seconds: case.rig.wait(round(float(seconds) * 1e9)),
+    r"goals sway": lambda case: setattr(case.rig, "restless", 0.006),
+    r"torque (on|off) (\d+)": lambda case, on, servo_id: case.rig.hardware.switch_torque(
+        case.row(servo_id), on == "on", case.answer
+    ),
+    r"register (\d+): (\w+) (-?\d+)": lambda case, servo_id, name, value: case.rig.hardware.write_register(
+        case.row(servo_id), name, int(value), case.answer
+    ),
+    r"mode (\d+): (\w+)": Case.change_mode,
+    r"bus unplugged": lambda case: case.rig.buses[0].unplug(),
+    r"bus plugged in": lambda case: case.rig.buses[0].plug_in(),
+    r"stop": Case.stop,
+}
+STEPS = SETUP | AFTER_START
+CHANGES: dict[str, Callable[..., object]] = {
+    r"silent": lambda _, servo: servo.silence(),
+    r"answers": lambda _, servo: servo.silence(False),
+    r"reboots": lambda _, servo: servo.power_cycle(),
+    r"overload": lambda _, servo: servo.trigger_overload(),
+    r"temperature (\S+)": lambda _, servo, value: servo.set_temperature(float(value)),
+    r"voltage (\S+)": lambda _, servo, value: servo.set_voltage(float(value)),
+    r"power cut for (\S+) s": lambda case, servo, time: servo.cut_power(
+        case.rig.clock.now_ns() + round(float(time) * 1e9)
+    ),
+    r"turned (\d+) ticks (above|below) its limits": turn_beyond,
+    r"turned by (\S+) rad": lambda _, servo, angle: turn_by_hand(servo, servo.shaft_angle + float(angle)),
+    r"reply lost": lambda case, servo: truncate_next(case.rig.buses[0], servo.servo_id, 0),
+    r"reply cut": lambda case, servo: truncate_next(case.rig.buses[0], servo.servo_id, 5),
+    r"reply corrupted": lambda case, servo: corrupt_next(case.rig.buses[0], servo.servo_id),
+    r"reply doubled": lambda case, servo: case.rig.buses[0].alter_next(servo.servo_id, "2", bytes, copies=2),
+    r"reply late by (\S+) ms": lambda case, servo, time: delay_next(
+        case.rig.buses[0], servo.servo_id, round(float(time) * 1e6)
+    ),
+    r"write lost": lambda case, _: case.rig.buses[0].alter_next_instruction("lost", lambda _: b""),
+    r"keeps (\w+) (-?\d+)": lambda case, servo, name, value: case.rig.stick(servo.servo_id, name, int(value)),
+    r"(\w+) (-?\d+)": poke,
+}
+EXPECTATIONS: dict[str, Callable[..., object]] = {
+    r"torque: (.+)": lambda case, ids: case.expect_flags(case.rig.torque(), ids),
+    r"valid: (.+)": lambda case, ids: case.expect_flags(case.rig.states.valid, ids),
+    r"goals: (.+)": lambda case, ids: case.expect_ids(case.rig.goals_sent()[-1][1], ids),
+    r"servo (\d+): (.+)": Case.expect_registers,
+    r"writes (\d+): (.+)": lambda case, servo_id, addresses: case.expect_ids(
+        [address for one, address, _ in case.rig.writes() if one == int(servo_id)], addresses
+    ),
+    r"mode (\d+): (\w+)": Case.expect_mode,
+}
+
+
+def read_cases(path: Path) -> Iterator[Case]:
+    """Yield the cases of a file."""
+    block: list[tuple[int, str]] = []
+    for number, line in enumerate([*path.read_text("utf-8").splitlines(), ""], 1):
+        if line.startswith("#"):
+            continue
+        if line:
+            block.append((number, line))
+        elif block:
+            (_, title), *lines = block
+            yield Case(path.name, title, lines)
+            block = []
