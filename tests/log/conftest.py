@@ -1,4 +1,4 @@
-"""A small robot's records, made as the loop makes them, and two foreign decoders."""
+"""A small robot's records, made as the loop makes them, runs of a whole robot, and a foreign decoder."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
@@ -14,9 +15,12 @@ from dxlrun.channels.cycle import CycleLayout, CycleRecord
 from dxlrun.log import schemas
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.schemas import LoggedController, LogHeader
+from dxlrun.plan.recording_plan import RecordingPlan
+from dxlrun.testing import VirtualRobot, plan_of
 
 PERIOD_NS = 20_000_000
 JOINTS = ("left_elbow_joint", "head_pitch_joint", "head_yaw_joint")
+ROBOTS = Path(__file__).parents[2] / "robots"
 
 
 @pytest.fixture
@@ -67,8 +71,25 @@ def cycle(layout: CycleLayout) -> Callable[[int], bytes]:
 
 
 @pytest.fixture
-def log(tmp_path: Path, header: LogHeader) -> LogWriter:
-    return LogWriter(tmp_path / "run.mcap", header)
+def path(tmp_path: Path) -> Path:
+    """Path of `log`."""
+    return tmp_path / "run.mcap"
+
+
+@pytest.fixture
+def log(path: Path, header: LogHeader) -> LogWriter:
+    return LogWriter(path, header)
+
+
+@pytest.fixture(scope="session")
+def torso(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with logs of the torso, whose head moves, for 2.5 s: `whole.mcap`, and `parts` of 1 s."""
+    folder = tmp_path_factory.mktemp("torso")
+    motion = ROBOTS / "motions/three_parts.yaml"
+    plan = plan_of(ROBOTS / "bioloid_torso.yaml", duration_s=2.5, play=[motion])
+    VirtualRobot(plan, log=folder / "whole.mcap").run()
+    VirtualRobot(replace(plan, recording=RecordingPlan(split_ns=1_000_000_000)), log=folder / "parts").run()
+    return folder
 
 
 @pytest.fixture(scope="session")

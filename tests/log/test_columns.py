@@ -29,6 +29,7 @@ from dxlrun.messages.definition import MessageType
 from dxlwire.packets import PacketKind
 
 Cycle = Callable[[int], bytes]
+KEYS = ["temperature", "voltage", "hardware_error", "mode"]
 RULE = "=" * 80
 MIXED = MessageType(
     "a/msg/Mixed",
@@ -139,7 +140,7 @@ def test_a_definition_that_cannot_be_laid_out_is_refused(text: str, sentence: st
 
 
 @pytest.fixture
-def path(tmp_path: Path, log: LogWriter, cycle: Cycle) -> Path:
+def written(path: Path, log: LogWriter, cycle: Cycle) -> Path:
     batch = PacketBatch(Handover(log.write_record))
     for number in range(100):
         batch.wake(number)
@@ -152,13 +153,13 @@ def path(tmp_path: Path, log: LogWriter, cycle: Cycle) -> Path:
         batch.packet(0, PacketKind.NOISE, 3, 8 + number, 9 + number, b"idle")
     batch.commit_packets()
     log.close()
-    return tmp_path / "run.mcap"
+    return path
 
 
-def test_topics_of_a_log_are_columns(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_topics_of_a_log_are_columns(written: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(log_reader, "SLICE_BYTES", 1)
-    log = read_log(path)
-    with open_log(path) as reader:
+    log = read_log(written)
+    with open_log(written) as reader:
         assert reader.header is not None
         assert reader.topics["/cycle"] == dxlrun.Topic("dxlrun_msgs/msg/Cycle", 100)
         assert reader.topics["/joint_states"].count == 50
@@ -169,27 +170,22 @@ def test_topics_of_a_log_are_columns(path: Path, monkeypatch: pytest.MonkeyPatch
         assert found["reference"].shape == (100, 0)
         assert found["t_ns"].tolist() == log.cycles["written_ns"].tolist()
         states = reader.columns("/joint_states")
-        assert set(states) == {
-            "t_ns", "header.stamp.sec", "header.stamp.nanosec", "header.frame_id",
-            "name", "position", "velocity", "effort",
-        }  # fmt: skip
+        stamp = {"t_ns", "header.stamp.sec", "header.stamp.nanosec", "header.frame_id"}
+        assert set(states) == stamp | {"name", "position", "velocity", "effort"}
         assert states["name"][7].tolist() == ["head_pitch_joint", "head_yaw_joint"]
         assert len(list(reader.batches("/joint_states", "position"))) > 5
         status = reader.columns("/diagnostics", "status.name", "status.values.key")
         assert status["status.name"].shape[1] == 3
-        assert status["status.values.key"][0, 0].tolist() == [
-            "temperature",
-            "voltage",
-            "hardware_error",
-            "mode",
-        ]
+        assert status["status.values.key"][0, 0].tolist() == KEYS
         packets = reader.columns("/bus/main", "cycle_delta", "kind")
         assert sum(map(len, packets["cycle_delta"])) == sum(map(len, packets["kind"])) == 200
 
 
-def test_slices_have_whole_cycles_with_all_their_packets(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_slices_have_whole_cycles_with_all_their_packets(
+    written: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(log_reader, "SLICE_BYTES", 1)
-    slices = list(open_log(path).slices())
+    slices = list(open_log(written).slices())
     assert len(slices) > 8
     for part in slices:
         assert sorted(part.cycles["cycle"].tolist() * 3) == sorted(part.packets.cycle.tolist())
@@ -198,9 +194,9 @@ def test_slices_have_whole_cycles_with_all_their_packets(path: Path, monkeypatch
     assert numbers == list(range(100))
 
 
-def test_arrow_has_the_same(path: Path) -> None:
+def test_arrow_has_the_same(written: Path) -> None:
     pyarrow = pytest.importorskip("pyarrow", reason="the extra logs is not installed")
-    table = open_log(path).arrow("/diagnostics").read_all()
+    table = open_log(written).arrow("/diagnostics").read_all()
     assert table.schema.field("header").type == pyarrow.struct(
         [
             ("stamp", pyarrow.struct([("sec", pyarrow.int32()), ("nanosec", pyarrow.uint32())])),
@@ -208,23 +204,22 @@ def test_arrow_has_the_same(path: Path) -> None:
         ]
     )
     status = table["status"][0].as_py()
-    assert [one["name"] for one in status] == list(read_log(path).joints)
+    assert [one["name"] for one in status] == list(read_log(written).joints)
     assert status[0]["values"][0]["key"] == "temperature"
-    chosen = open_log(path).arrow("/diagnostics", "status.values.key", "header.stamp.sec").read_all()
+    chosen = open_log(written).arrow("/diagnostics", "status.values.key", "header.stamp.sec").read_all()
     assert chosen.schema.names == ["t_ns", "status.values.key", "header.stamp.sec"]
-    assert chosen["status.values.key"][0].as_py()[0] == ["temperature", "voltage", "hardware_error", "mode"]
+    assert chosen["status.values.key"][0].as_py()[0] == KEYS
 
 
-def test_without_pyarrow_the_extra_is_named(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_pyarrow_the_extra_is_named(written: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(InputError, match=r"pip install 'dxlrun\[logs\]'"):
-        open_log(path).arrow("/cycle")
+        open_log(written).arrow("/cycle")
 
 
 @pytest.fixture(params=["zstd", "lz4", "none", "no chunks"])
-def foreign(tmp_path: Path, request: pytest.FixtureRequest) -> Path:
+def foreign(path: Path, request: pytest.FixtureRequest) -> Path:
     """What another program wrote, with its library."""
-    path = tmp_path / "bag_0.mcap"
     kind = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4}.get(request.param, CompressionType.NONE)
     with path.open("wb") as stream:
         writer = RosWriter(stream, chunk_size=4096, compression=kind)
@@ -277,8 +272,8 @@ def test_a_foreign_file_that_was_cut_is_read_as_far_as_it_is_there(foreign: Path
     assert reader.topics["/joint_states"].count is None
 
 
-def test_what_is_not_there_is_named(path: Path) -> None:
-    reader = open_log(path)
+def test_what_is_not_there_is_named(written: Path) -> None:
+    reader = open_log(written)
     with pytest.raises(LogError, match=r"run.mcap: no topic /joint_stats; did you mean /joint_states"):
         reader.columns("/joint_stats")
     with pytest.raises(LogError, match="messages of /cycle have no field positon; did you mean position"):
@@ -291,16 +286,15 @@ def test_what_is_not_there_is_named(path: Path) -> None:
         (
             "json",
             "jsonschema",
-            "messages of /x have the encoding 'json' and a schema in 'jsonschema'; dxlrun reads only 'cdr'",
+            "have the encoding 'json' and a schema in 'jsonschema'; dxlrun reads only 'cdr'",
         ),
-        ("cdr", "ros2idl", "messages of /x have the encoding 'cdr' and a schema in 'ros2idl'"),
-        ("cdr", "ros2msg", "messages of /x cannot be read: a/msg/X: the bytes are not little-endian CDR"),
+        ("cdr", "ros2idl", "have the encoding 'cdr' and a schema in 'ros2idl'"),
+        ("cdr", "ros2msg", "cannot be read: a/msg/X: the bytes are not little-endian CDR"),
     ],
 )
 def test_messages_in_another_encoding_are_refused_with_a_sentence(
-    tmp_path: Path, encoding: str, schema: str, sentence: str
+    path: Path, encoding: str, schema: str, sentence: str
 ) -> None:
-    path = tmp_path / "x.mcap"
     with path.open("wb") as stream:
         writer = Writer(stream)
         writer.start()
@@ -308,15 +302,15 @@ def test_messages_in_another_encoding_are_refused_with_a_sentence(
         channel = writer.register_channel("/x", encoding, number)
         writer.add_message(channel, 0, b"\0\0\0\0\1\2\3\4", 0)
         writer.finish()
-    with pytest.raises(LogError, match=sentence):
+    with pytest.raises(LogError, match=f"messages of /x {sentence}"):
         open_log(path).columns("/x")
 
 
-def test_the_example_of_the_page_runs(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_example_of_the_page_runs(written: Path, capsys: pytest.CaptureFixture[str]) -> None:
     page = page_text("analyze.md")
     example = page.split("```python\n")[1].split("```")[0]
     assert "open_log" in example
-    exec(example.replace('"LOG"', repr(str(path))), {})  # noqa: S102  the page is ours
+    exec(example.replace('"LOG"', repr(str(written))), {})  # noqa: S102  the page is ours
     shown = capsys.readouterr().out.splitlines()
     assert shown[0].startswith("torso {'/cycle': 'dxlrun_msgs/msg/Cycle'")
     assert shown[1:] == ["99 60000 99", "1 60000 1", "(50, 2)", "()"]

@@ -11,13 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from mcap.reader import make_reader
-from mcap_ros2.decoder import DecoderFactory
-from msgspec import structs
 from msgspec.structs import replace
 from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_typestore
+from scipy.spatial.transform import Rotation
 from tests.kit.campaigns import campaign
+from tests.kit.decoded import decode_log
 
 from dxlrun.channels.cycle import CycleRecord
 from dxlrun.channels.ring import RecordKind
@@ -27,8 +26,7 @@ from dxlrun.log.log_reader import open_log
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.packing.frame_messages import FrameMessages
 from dxlrun.log.schemas import LogHeader
-from dxlrun.plan.recording_plan import RecordingPlan
-from dxlrun.testing import VirtualRobot, plan_of, read_log
+from dxlrun.testing import read_log, simulated_robot
 from dxlsim.geometry.urdf import read_urdf
 
 ROBOTS = Path(__file__).parents[2] / "robots"
@@ -41,8 +39,6 @@ Transforms = dict[tuple[str, str], Matrix]
 
 def matrix(transform: Any) -> Matrix:
     """Return translation and rotation of a decoded message as a homogeneous matrix."""
-    from scipy.spatial.transform import Rotation
-
     at, turn = transform.translation, transform.rotation
     found = np.eye(4)
     found[:3, :3] = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix()
@@ -128,31 +124,13 @@ def test_poses_of_logged_frames_are_those_of_pinocchio(
 # A whole log
 
 
-@pytest.fixture(scope="module")
-def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The torso for 2.5 s, in which its head moves."""
-    path = tmp_path_factory.mktemp("frames") / "torso.mcap"
-    plan = plan_of(ROBOTS / "bioloid_torso.yaml", duration_s=2.5, play=[ROBOTS / "motions/three_parts.yaml"])
-    VirtualRobot(plan, log=path).run()
-    return path
-
-
-def decoded(path: Path, topic: str) -> list[tuple[int, Any]]:
-    with path.open("rb") as stream:
-        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-        return [(one.log_time, message) for _, _, one, message in reader.iter_decoded_messages([topic])]
-
-
-def test_stamps_are_those_of_cycles_and_angles_those_of_the_joints(log: Path) -> None:
-    from scipy.spatial.transform import Rotation
-
-    read, urdf = read_log(log), read_urdf(TORSO.read_text())
+def test_stamps_are_those_of_cycles_and_angles_those_of_the_joints(torso: Path) -> None:
+    read, urdf = read_log(torso / "whole.mcap"), read_urdf(TORSO.read_text())
     cycles = {int(cycle["read_ns"]) + read.header.epoch_offset_ns: cycle for cycle in read.cycles}
-    frames = decoded(log, "/tf")
     yaw = urdf.joint("head_yaw_joint")
     assert yaw is not None
     angles = []
-    for t_ns, message in frames:
+    for _, t_ns, message, *_ in decode_log(torso / "whole.mcap", "/tf"):
         stamps = {(each.header.stamp.sec, each.header.stamp.nanosec) for each in message.transforms}
         assert stamps == {divmod(t_ns, 1_000_000_000)}
         local = transforms(message)[yaw.parent, yaw.child]
@@ -160,35 +138,29 @@ def test_stamps_are_those_of_cycles_and_angles_those_of_the_joints(log: Path) ->
         row = read.joints.index(yaw.name)
         assert angles[-1] == pytest.approx(cycles[t_ns]["position"][row], abs=1e-9)
         assert local[:3, 3] == pytest.approx(yaw.xyz)
-    assert len(frames) in {75, 76}  # 30 a second, from the first cycle on
+    assert len(angles) in {75, 76}  # 30 a second, from the first cycle on
     assert np.ptp(angles) > 0.3
 
 
-def test_what_does_not_move_is_logged_once_and_kept_for_who_comes_later(log: Path) -> None:
-    ((_, message),) = decoded(log, "/tf_static")
-    moving = {pair for _, each in decoded(log, "/tf") for pair in transforms(each)}
+def test_what_does_not_move_is_logged_once_and_kept_for_who_comes_later(torso: Path) -> None:
     urdf = read_urdf(TORSO.read_text())
-
-    assert moving == {(joint.parent, joint.child) for joint in urdf.joints if joint.moves}
-    assert set(transforms(message)) == {
-        (joint.parent, joint.child) for joint in urdf.joints if not joint.moves
-    }
-    with log.open("rb") as stream:
-        summary = make_reader(stream).get_summary()
-    assert summary is not None
-    (channel,) = [each for each in summary.channels.values() if each.topic == "/tf_static"]
-    (moved,) = [each for each in summary.channels.values() if each.topic == "/tf"]
-    assert "offered_qos_profiles" not in moved.metadata  # an old place is worth nothing
-    (profile,) = yaml.safe_load(channel.metadata["offered_qos_profiles"])
-    assert (profile["durability"], profile["history"], profile["depth"]) == (1, 1, 1)
+    for log in (torso / "whole.mcap", *sorted((torso / "parts").iterdir())):
+        (fixed,) = decode_log(log, "/tf_static")
+        moved = [*decode_log(log, "/tf")]
+        pairs = {(joint.parent, joint.child): joint.moves for joint in urdf.joints}
+        assert {pair for one in moved for pair in transforms(one.message)} == {p for p in pairs if pairs[p]}
+        assert set(transforms(fixed.message)) == {pair for pair, moves in pairs.items() if not moves}
+        assert "offered_qos_profiles" not in moved[0].channel.metadata  # an old place is worth nothing
+        (profile,) = yaml.safe_load(fixed.channel.metadata["offered_qos_profiles"])
+        assert (profile["durability"], profile["history"], profile["depth"]) == (1, 1, 1)
 
 
-def test_rerun_shows_a_robot_that_moves(log: Path) -> None:
+def test_rerun_shows_a_robot_that_moves(torso: Path) -> None:
     """Its own reader finds the shapes of the body, and a tree of transforms that is whole and moves."""
     chunks = pytest.importorskip("rerun.chunk", reason=ONLY_311)
     rows: dict[tuple[str, str], list[list[float]]] = {}
     entities = set()
-    for chunk in chunks.McapReader(log).stream():
+    for chunk in chunks.McapReader(torso / "whole.mcap").stream():
         entities.add(chunk.entity_path)
         batch = chunk.to_record_batch()
         if chunk.entity_path in {"/tf", "/tf_static"} and "Transform3D:quaternion" in batch.schema.names:
@@ -202,38 +174,24 @@ def test_rerun_shows_a_robot_that_moves(log: Path) -> None:
     urdf = read_urdf(TORSO.read_text())
     assert set(rows) == {(joint.parent, joint.child) for joint in urdf.joints}
     column = np.array(rows["base_link", "neck_link"])
-    ours = open_log(log).columns("/tf", "transforms.transform.rotation.z")
+    ours = open_log(torso / "whole.mcap").columns("/tf", "transforms.transform.rotation.z")
     mine = ours["transforms.transform.rotation.z"].reshape(len(column), -1)
     assert len(column) in {75, 76}
     assert any(np.abs(each - column[:, 2]).max() < 1e-6 for each in mine.T)  # Rerun has float32
     assert np.ptp(2 * np.arctan2(column[:, 2], column[:, 3])) > 0.3  # rad about z: the head
 
 
-def test_each_part_of_a_log_has_the_frames_that_do_not_move(tmp_path: Path) -> None:
-    plan = plan_of(ROBOTS / "bioloid_torso.yaml", duration_s=0.4)
-    VirtualRobot(
-        structs.replace(plan, recording=RecordingPlan(split_ns=200_000_000)), log=tmp_path / "log"
-    ).run()
-    parts = sorted((tmp_path / "log").iterdir())
-
-    assert len(parts) > 1
-    assert {len(decoded(part, "/tf_static")) for part in parts} == {1}
-    assert sum(len(decoded(part, "/tf")) for part in parts) == pytest.approx(12, abs=len(parts))
-
-
 @pytest.mark.parametrize(("rate", "counts"), [(0, {0}), (10, {4, 5}), (1000, {20})])
 def test_the_rate_is_that_of_the_file_and_never_above_the_loop(
-    rate: float, counts: set[int], tmp_path: Path
+    rate: float, counts: set[int], path: Path
 ) -> None:
     text = (ROBOTS / "bioloid_torso.yaml").read_text()
-    (tmp_path / "robot.yaml").write_text(
-        text.replace("{urdf: urdf/bioloid_torso.urdf}", f"{{urdf: {TORSO}, frames_rate: {rate}}}")
-    )
-    path = tmp_path / "log.mcap"
-    VirtualRobot(plan_of(tmp_path / "robot.yaml", duration_s=0.4), log=path).run()
+    robot = path.with_name("robot.yaml")
+    model = f"{{urdf: {TORSO}, frames_rate: {rate}}}"
+    robot.write_text(text.replace("{urdf: urdf/bioloid_torso.urdf}", model))
+    simulated_robot(robot, duration_s=0.4, log=path).run()
     topics = open_log(path).topics
-
-    assert len(decoded(path, "/tf")) in counts
+    assert len([*decode_log(path, "/tf")]) in counts
     assert ("/tf_static" in topics) == (rate > 0)
     assert "/robot_description" in topics
 
@@ -256,8 +214,6 @@ def test_a_joint_that_was_never_read_is_shown_when_it_is_and_stays_where_it_was(
 
 
 def test_the_torso_turns_with_its_imu_from_when_that_is_known() -> None:
-    from scipy.spatial.transform import Rotation
-
     scene = Scene(TORSO.read_text(), ("head_yaw_joint",), "imu")
     assert ("odom", "imu") not in transforms(scene.at({}))
     turned = Rotation.from_euler("xyz", [0.2, -0.3, 0.4])
@@ -274,8 +230,6 @@ def test_the_torso_turns_with_its_imu_from_when_that_is_known() -> None:
 
 
 def test_quaternions_are_of_length_one_and_never_change_their_sign_at_once() -> None:
-    from scipy.spatial.transform import Rotation
-
     scene = Scene(TORSO.read_text(), ("head_yaw_joint",), "imu")
     last: dict[str, NDArray[np.float64]] = {}
     for number in range(220):
@@ -292,30 +246,25 @@ def test_quaternions_are_of_length_one_and_never_change_their_sign_at_once() -> 
 
 
 def test_the_stamp_is_when_the_states_were_read(
-    header: LogHeader, cycle: Callable[[int], bytes], tmp_path: Path
+    header: LogHeader, cycle: Callable[[int], bytes], path: Path
 ) -> None:
-    joint = header.joints[0]
-    urdf = (
-        f'<robot name="one"><link name="base"/><link name="arm"/><joint name="{joint}" type="continuous">'
-        '<parent link="base"/><child link="arm"/></joint></robot>'
-    )
-    path = tmp_path / "log.mcap"
+    joint, links = header.joints[0], '<link name="base"/><link name="arm"/>'
+    ends = '<parent link="base"/><child link="arm"/>'
+    urdf = f'<robot name="one">{links}<joint name="{joint}" type="continuous">{ends}</joint></robot>'
     writer = LogWriter(path, replace(header, robot_description=urdf, frames=FramesPlan(1000, (joint,))))
     data = cycle(3)
     writer.write_record(RecordKind.CYCLE, data)
     writer.close()
     read_ns = int(np.frombuffer(data, header.layout.dtype)[0]["read_ns"]) + header.epoch_offset_ns
-    ((t_ns, message),) = decoded(path, "/tf")
-    stamp = message.transforms[0].header.stamp
+    (one,) = decode_log(path, "/tf")
+    stamp = one.message.transforms[0].header.stamp
+    assert (one.t_ns, stamp.sec, stamp.nanosec) == (read_ns, *divmod(read_ns, 1_000_000_000))
 
-    assert (t_ns, stamp.sec, stamp.nanosec) == (read_ns, *divmod(read_ns, 1_000_000_000))
 
-
-def test_a_robot_without_a_urdf_has_no_frames(header: LogHeader, tmp_path: Path) -> None:
+def test_a_robot_without_a_urdf_has_no_frames(header: LogHeader, path: Path) -> None:
     assert header.robot_description is None
-    LogWriter(tmp_path / "plain.mcap", replace(header, frames=FramesPlan(30))).close()
-
-    assert schemas.LogTopic.FRAMES not in open_log(tmp_path / "plain.mcap").topics
+    LogWriter(path, replace(header, frames=FramesPlan(30))).close()
+    assert schemas.LogTopic.FRAMES not in open_log(path).topics
 
 
 # An IMU on a moving link, linear and mimic joints
@@ -338,8 +287,6 @@ JAW = """\
 
 def test_a_body_whose_imu_is_on_a_moving_link_stands_upright() -> None:
     """What the IMU measures is only how its link moves: `tilt` about y, and its mount about x."""
-    from scipy.spatial.transform import Rotation
-
     scene = Scene(TILTING, ("tilt",), "imu")
     for angle in np.linspace(-1.5, 1.5, 7):
         measured = Rotation.from_euler("y", angle) * Rotation.from_euler("x", 0.4)
