@@ -17,9 +17,9 @@ from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
-from tests.analysis.stranger.expectation import HARDWARE, Case, compared
-from tests.analysis.stranger.kit import ROBOTS, Story
-from tests.analysis.stranger.live import Run, compile_jobs, compiling, hog_on_the_core_of_the_loop
+from tests.analysis.verdicts.cases import HARDWARE, Case
+from tests.analysis.verdicts.live import Run, compile_jobs, compiling, hog_on_the_core_of_the_loop
+from tests.analysis.verdicts.rig import ROBOTS, Story
 
 NAMES = ("mx_two", "ax_single", "x_three")
 
@@ -65,8 +65,7 @@ def main() -> int:
             story.duration_s = options.seconds + 2
             story.motion = story.swing()
             story.disturb = LOADS[load]
-            case = Case(load, "free", "", (name,), lambda story: None, innocents=HARDWARE, live=True)
-            found = compared(case, name, story.run())
+            found = Case(load, (name,), spared=HARDWARE).compare(ROBOTS[name], story.run())
         counts[load, "runs"] += 1
         counts[load, "good"] += found.verdict.good
         counts[load, "accused"] += bool(found.accused)

@@ -1,21 +1,16 @@
-"""Whose missing replies are, over all buses, and at which angle or speed of the joint."""
+"""Whose missing replies are, and at which angle or speed of the joint; of runs, see verdicts/losses.txt."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from tests.analysis.stranger.kit import JOINTS, ROBOTS, Story
 
-from dxlrun.log.log_reader import read_log
 from dxlrun_analysis.report import analyze_log
 from dxlrun_analysis.servos.joint_states import BINS
 from dxlrun_analysis.servos.losses import narrowest
-from dxlrun_analysis.servos.traffic import Traffic
 from dxlwire.packets import PacketKind
 
 Make = Callable[..., Any]
@@ -110,106 +105,6 @@ def test_a_block_that_a_fast_status_lacks_is_late_where_it_comes_by_itself(
     cut = b"\xff\xff\xfd\x00\xfe\x1a\x00\x55" + bytes((0, 3, 1, 2, 3, 4, 5, 6))
     packets = [(ASK, 254, FAST_READ), (STATUS, 254, cut), (ASK, 254, PING_ALL), (NOISE, 254, block)]
     assert own(write, wire, packets).get(7) == (None if is_late else (1, 1))
-
-
-Inject = Callable[[Story], object]
-
-
-@pytest.fixture
-def found(tmp_path: Path) -> Callable[[str, Inject], list[tuple[str, str]]]:
-    """Inject faults from 1 s on in a run of 5 s: codes and subjects of what is found."""
-
-    def found(robot: str, inject: Inject) -> list[tuple[str, str]]:
-        story = Story(ROBOTS[robot], "losses", tmp_path)
-        story.duration_s = 5.0
-        inject(story)
-        traffic, log = Traffic(), read_log(story.run())
-        traffic.add_slice(log)
-        traffic.summarize_traffic()
-        return sorted((one.code, one.subject) for one in traffic.findings)
-
-    return found
-
-
-def again(period_s: float, for_s: float) -> Callable[[float], bool]:
-    return lambda t_s: t_s > 1 and (t_s - 1) % period_s < for_s
-
-
-def cut(story: Story, joint: str, when: Callable[[float], bool]) -> None:
-    story.at(0.01, lambda: story.interrupt(joint, lambda: not when(story.now_s(joint))), joint)
-
-
-def lossy(story: Story, joint: str, share: float = 0.08) -> None:
-    cut(story, joint, lambda t_s: t_s > 1 and story.random.random() < share)
-
-
-def deaf(story: Story, bus: int, when: Callable[[float], bool]) -> None:
-    story.on_arrival(bus, lambda servo, data, t_s: b"" if when(t_s) else data)
-
-
-def late(story: Story, joint: str, by_s: float) -> None:
-    story.alter(joint, lambda t_s: (bytes, by_s) if t_s > 1 and story.random.random() < 0.5 else None, "late")
-
-
-@pytest.mark.parametrize("robot", ["mx_two", "x_three"])
-def test_a_hub_that_stalls_accuses_no_servo_and_no_single_bus(robot: str, found: Make) -> None:
-    stalls = again(0.6113, 0.05)
-    findings = found(robot, lambda story: story.hand_over_late((0, 1), lambda t: 0.06 * stalls(t), "stall"))
-    assert findings == [("late_replies", "machine")]
-
-
-@pytest.mark.parametrize("robot", ["mx_two", "x_three"])
-def test_buses_that_lose_replies_in_the_same_cycles_accuse_what_they_share(robot: str, found: Make) -> None:
-    findings = found(robot, lambda story: [deaf(story, bus, again(0.4313, 0.012)) for bus in (0, 1)])
-    assert findings == [("lossy_line", "machine")]
-
-
-@pytest.mark.parametrize("robot", ["mx_bulk", "ax_single", "x_fast", "x_sync"])
-def test_an_adapter_that_is_deaf_again_and_again_accuses_no_servo(robot: str, found: Make) -> None:
-    assert found(robot, lambda story: deaf(story, 0, again(0.4313, 0.1))) == [("lossy_line", "main")]
-
-
-@pytest.mark.parametrize("robot", ["mx_bulk", "ax_single", "x_fast", "x_sync"])
-def test_a_slow_servo_and_a_lossy_one_of_a_bus_are_both_named(robot: str, found: Make) -> None:
-    findings = found(robot, lambda story: (late(story, "left_elbow", 0.004), lossy(story, "right_knee")))
-    assert {("slow_servo", "left_elbow"), ("lossy_servo", "right_knee")} <= set(findings)
-    assert not {subject for _, subject in findings} - {"left_elbow", "right_knee", "main"}
-
-
-@pytest.mark.parametrize("robot", ["mx_two", "ax_single"])
-def test_two_lossy_servos_are_both_named_on_one_bus_or_on_two(robot: str, found: Make) -> None:
-    findings = found(
-        robot, lambda story: [lossy(story, joint, 0.3) for joint in ("left_elbow", "right_knee")]
-    )
-    assert findings == [("lossy_servo", "left_elbow"), ("lossy_servo", "right_knee")]
-
-
-@pytest.mark.parametrize("joints", [("left_elbow", "left_knee"), ("head_yaw", "head_pitch")])
-@pytest.mark.parametrize("robot", ["mx_bulk", "ax_single"])
-def test_servos_that_lose_replies_at_the_same_occasions_are_named_together(
-    robot: str, joints: tuple[str, str], found: Make
-) -> None:
-    findings = found(robot, lambda story: [cut(story, joint, again(0.4117, 0.05)) for joint in joints])
-    assert findings == [("lossy_servo", "main")]
-
-
-def test_where_all_servos_lose_replies_now_and_then_it_is_none_of_them(found: Make) -> None:
-    findings = found("ax_single", lambda story: [lossy(story, joint, 0.03) for joint in JOINTS])
-    assert findings == [("lossy_line", "main")]
-
-
-def test_a_plug_that_is_loose_at_some_angles_is_told_with_them(tmp_path: Path) -> None:
-    story = Story(ROBOTS["mx_bulk"], "losses", tmp_path)
-    story.duration_s = 10.0
-    story.fault("loose servo={id} low=195deg high=205deg share=0.2 at=1s", "left_knee")
-    story.motion = story.swing(left_knee="0.7 * sin(3 * t)")
-    traffic, log = Traffic(), read_log(story.run())
-    traffic.add_slice(log)
-    traffic.summarize_traffic()
-    (finding,) = traffic.findings
-    assert (finding.code, finding.subject) == ("lossy_servo", "left_knee")
-    told = r"(\d+) episodes, (\d+) of them between 1\d and 2\d deg \(1?\d% of the time\)"
-    assert re.search(told, finding.sentence), finding.sentence
 
 
 BROKEN = bytes.fromhex("fffffd00030800550001")

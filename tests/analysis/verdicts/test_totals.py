@@ -1,0 +1,35 @@
+"""Verdicts on totals of runs: what may not be in a good run, what is said first, and who is accused of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from tests.analysis.judged import Case, read_cases
+
+CASES = list(read_cases(Path(__file__).with_name("totals.txt")))
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_verdict_on_totals(case: Case) -> None:
+    assert case.expected, case.name
+    case.check()
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("a\n  machine lazy\n  => good\n", "a.txt:2: 'machine lazy' is no line of a run"),
+        ("a\n  => not good\n", "a.txt:2: not good"),
+        ("a\n  => 0: Bad\n", "a.txt:2: 0: Bad"),
+        ("a\n  => has noise\n", "a.txt:2: has noise"),
+        ("a\n  servos elbow\n  => none: answered\n", "a.txt:3: none: answered"),
+        ("a\n  machine busy\n  => no busy_machine\n", "a.txt:3: no busy"),
+        ("a\n  machine busy\n  => no fix busy_machine machine: End other\n", "a.txt:3: no fix"),
+    ],
+)
+def test_what_does_not_hold_is_named_with_its_line(text: str, told: str, tmp_path: Path) -> None:
+    (tmp_path / "a.txt").write_text(text)
+    (case,) = read_cases(tmp_path / "a.txt")
+    with pytest.raises(AssertionError, match=told):
+        case.check()

@@ -1,0 +1,68 @@
+"""Faults of robots on virtual time: a verdict names the cause and accuses no innocent. The cases are `*.txt`.
+
+Each number of the campaign draws a pair of a case and a robot; `--campaign=release` runs all pairs. Only it
+includes pairs that take real time, and pairs whose cause is known not to be named: such a pair has to stay
+unnamed, or lose that line.
+"""
+
+from __future__ import annotations
+
+import random
+from pathlib import Path
+
+import pytest
+from tests.analysis.verdicts.cases import Case, read_cases
+from tests.kit.campaigns import campaign
+
+HERE = Path(__file__).parent
+CASES = [case for file in sorted(HERE.glob("*.txt")) if file.stem != "losses" for case in read_cases(file)]
+PAIRS = [(case, robot) for case in CASES for robot in case.robots]
+DRAWN = [(case, robot) for case, robot in PAIRS if not case.is_live and robot not in case.unnamed]
+LOSSES = [(case, robot) for case in read_cases(HERE / "losses.txt") for robot in case.robots]
+
+
+def check(case: Case, robot: str, directory: Path) -> None:
+    found = case.judge(robot, directory)
+    assert not found.accused, f"{case.place}: {robot}: {case.happens}\n{found}"
+    assert bool(found.wrong) == (robot in case.unnamed), f"{case.place}: {robot}: {case.happens}\n{found}"
+
+
+def test_every_case_says_what_happens(tmp_path: Path) -> None:
+    assert len({case.name for case in CASES}) == len(CASES) > 60
+    for case, robot in PAIRS:
+        assert case.happens.endswith(".")
+        assert set(case.unnamed) <= set(case.robots)
+        assert case.causes or case.good, f"{case.place}: what is expected?"
+        case.prepare(robot, tmp_path)
+
+
+@campaign(ci=4, night=30, release=len(PAIRS))
+def test_verdict_names_the_cause_and_accuses_no_innocent(
+    number: int, amount: float, chance: random.Random, tmp_path: Path
+) -> None:
+    case, robot = PAIRS[number] if amount == len(PAIRS) else chance.choice(DRAWN)
+    print(case.place, case.name, robot)
+    check(case, robot, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("case", "robot"), [pytest.param(*one, id=f"{one[0].name}-{one[1]}") for one in LOSSES]
+)
+def test_missing_and_late_replies_are_those_of_the_part_that_fails(
+    case: Case, robot: str, tmp_path: Path
+) -> None:
+    check(case, robot, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("  swing\n", "bad.txt:1: a line before the first case"),
+        ("some case: torso\n", "bad.txt:1: write NAME: ROBOTS, of mx_bulk, mx_two"),
+        ("some case: x_fast\n  # A.\n  swing wildly\n", "bad.txt:3: 'swing wildly' is no line of a case"),
+    ],
+)
+def test_mistake_in_a_case_is_named_with_its_line(text: str, told: str, tmp_path: Path) -> None:
+    (tmp_path / "bad.txt").write_text(text)
+    with pytest.raises(ValueError, match=told):
+        [case.prepare("x_fast", tmp_path) for case in read_cases(tmp_path / "bad.txt")]
