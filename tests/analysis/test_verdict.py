@@ -1,4 +1,4 @@
-"""The verdict on logs: what it takes from them, and one verdict everywhere. See verdicts/totals.txt, too."""
+"""The verdict on logs: what it takes from them, and one verdict everywhere. See totals.txt, too."""
 
 from __future__ import annotations
 

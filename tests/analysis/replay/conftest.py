@@ -132,17 +132,10 @@ def robot_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def run(robot_file: Path, tmp_path: Path) -> Callable[..., Path]:
     """Run the robot for a second on virtual time, return its log; `before` sees the robot before it runs."""
 
-    def begin(
-        before: Callable[[VirtualRobot], None] | None = None,
-        robot: Path = robot_file,
-        duration_s: float = 1.0,
-    ) -> Path:
-        path = tmp_path / "run.mcap"
-        one = simulated_robot(
-            robot, play=[robot_file.with_name("look.yaml")], duration_s=duration_s, log=path
-        )
-        if before:
-            before(one)
+    def begin(before: Callable[[VirtualRobot], None], robot: Path = robot_file, seconds: float = 1.0) -> Path:
+        play, path = [robot_file.with_name("look.yaml")], tmp_path / "run.mcap"
+        one = simulated_robot(robot, play=play, duration_s=seconds, log=path)
+        before(one)
         one.run()
         return path
 

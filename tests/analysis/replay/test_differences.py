@@ -1,60 +1,64 @@
-"""A replay can fail: whatever is not the same is named, down to one bit."""
+"""A replay can fail: whatever is not the same is named, down to one bit; also messages, prepared arrays."""
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
-from tests.kit.anew import add, flip, plan, put
+from msgspec import structs
+from tests.kit.anew import Change, add, flip, messages, plan, put
 from tests.kit.stories import differing
 
+import dxlrun_lab.commands.replay
+from dxlrun.channels.commands import CommandMessage, encode_command
+from dxlrun.channels.tagged import decode
+from dxlrun.control.controllers.plugin_loading import load_plugins
+from dxlrun.description.motion import read_motion
 from dxlrun.errors import ControllerFault, InputError
 from dxlrun.log.log_reader import read_log
-from dxlrun.testing import simulated_robot
+from dxlrun.output.terminal import show_parts
+from dxlrun.remote.motion_requests import RunSnapshot, schedule_motion
+from dxlrun.remote.preparation import Preparation
+from dxlrun.testing import VirtualRobot, simulated_robot
 from dxlrun_analysis.replay import Setting, replay_log
+from dxlrun_controllers.motions.joint_trajectory_controller import JointTrajectoryController
 
 Changed = Callable[..., Path]
 JOINTS = ("pan", "tilt", "nod")
 OWNERS = ("head", "all_inputs", "all_inputs")
 ROBOTS = Path(__file__).parents[3] / "robots"
+STATE = "/all_inputs/state"
+COMMAND, GOAL = "command of the {}", "goal of the {}, after the last gate"
 
 
-@pytest.mark.parametrize(
-    ("field", "what"),
-    [
-        ("command_position", "command of the position"),
-        ("command_velocity", "command of the velocity"),
-        ("goal_position", "goal of the position, after the last gate"),
-        ("goal_velocity", "goal of the velocity, after the last gate"),
-    ],
-)
+# Values of cycles
+
+
+@pytest.mark.parametrize("field", ["command_position", "command_velocity", "goal_position", "goal_velocity"])
 @pytest.mark.parametrize("bit", [0, 31, 52, 63])
-def test_one_bit_of_one_value_is_named(
-    pair_log: Path, changed: Changed, field: str, what: str, bit: int
-) -> None:
-    row, cycle = bit % 3, 7 + bit % 40
+def test_one_bit_of_one_value_is_named(pair_log: Path, changed: Changed, field: str, bit: int) -> None:
+    row, cycle, (kind, quantity) = bit % 3, 7 + bit % 40, field.split("_")
     report, first = differing(changed(pair_log, flip(field, cycle, row, bit)))
     assert (report.compared, report.different) == (50, 1)
+    what = (COMMAND if kind == "command" else GOAL).format(quantity)
     assert (first.cycle, first.joint, first.controller, first.what) == (cycle, JOINTS[row], OWNERS[row], what)
     assert first.time_s == pytest.approx(cycle * 0.02)
     assert first.recorded != first.replayed
     (joint,) = report.joints
-    assert (joint.joint, joint.commands, joint.goals) == (
-        JOINTS[row],
-        int("command" in field),
-        int("goal" in field),
-    )
+    assert (joint.joint, joint.commands, joint.goals) == (JOINTS[row], kind == "command", kind == "goal")
 
 
-def test_the_bits_of_nan_and_of_zero_count(pair_log: Path, changed: Changed) -> None:
+def test_bits_of_nan_and_of_zero_count(pair_log: Path, changed: Changed) -> None:
     # tilt never gets a speed: what all_inputs left at NaN
     _, first = differing(changed(pair_log, flip("command_velocity", 12, 1, 63)))
-    assert (first.recorded, first.replayed) == (
-        "nan (bits 0xfff8000000000000)",
-        "nan (bits 0x7ff8000000000000)",
-    )
+    bits = "nan (bits 0xfff8000000000000)", "nan (bits 0x7ff8000000000000)"
+    assert (first.recorded, first.replayed) == bits
     # the trajectory begins at 0 rad, or near it; a recorded -0.0 is not 0.0
     at_first = read_log(pair_log).cycles["command_position"][3, 0]
     assert at_first != 0.0 or not np.signbit(at_first)
@@ -74,7 +78,7 @@ def test_every_recorded_state_is_an_input(pair_log: Path, changed: Changed, stat
 def test_what_the_controllers_began_with_is_an_input(pair_log: Path, changed: Changed, values: str) -> None:
     report, first = differing(changed(pair_log, put(values, (0, 2), 1.25, of="activation")))
     # what the controller published when it was activated
-    assert (first.cycle, first.what) == (-1, "message of /all_inputs/state: sum[1]")
+    assert (first.cycle, first.what) == (-1, f"message of {STATE}: sum[1]")
     assert [joint.joint for joint in report.joints] == ["nod"]
 
 
@@ -95,23 +99,28 @@ def test_another_parameter_is_seen_at_its_first_cycle(pair_log: Path) -> None:
     assert report.sentence == "pair: 50 of 50 replayed cycles differ"
     assert report.different_messages  # its own goals are an input of the next cycle
 
-
-def test_a_trajectory_without_speeds_differs_when_it_begins(pair_log: Path) -> None:
     report, first = differing(pair_log, "head.command_interface=position")
     assert (first.cycle, first.joint, first.controller) == (10, "pan", "head")
     assert first.what == "command of the velocity"
     assert first.replayed.startswith("nan")
     assert report.prepared == 1  # whether they differ is the controller's own matter
 
-
-def test_a_parameter_that_ends_the_replay_early(pair_log: Path) -> None:
     report, first = differing(pair_log, "all_inputs.give_up_after=0.31")
     assert (report.compared, first.cycle) == (17, 16)
     assert "all_inputs raised in update: RuntimeError: out of ideas" in report.fault
 
 
+def test_limit_of_the_gate_from_an_argument(pair_log: Path) -> None:
+    report = replay_log(pair_log, (), {"speed": "0.8 rad/s"})
+    first = report.first
+    assert first is not None
+    assert (first.joint, first.controller) == ("pan", "head")
+    assert first.what.startswith("goal of the")
+    assert [(one.joint, one.commands) for one in report.joints if one.commands] == []
+
+
 @pytest.mark.parametrize(
-    ("setting", "says"),
+    ("wrong", "says"),
     [
         ("neck.gain=1", "no such controller; known: all_inputs, head, states"),
         ("haed.gain=1", "did you mean head?"),
@@ -124,51 +133,33 @@ def test_a_parameter_that_ends_the_replay_early(pair_log: Path) -> None:
         ("all_inputs.gain=[", "is not YAML"),
         ("all_inputs.gain", "sets nothing"),
         ("gain=1", "sets nothing"),
-    ],
-)
-def test_a_setting_that_does_not_fit_is_one_sentence(pair_log: Path, setting: str, says: str) -> None:
-    with pytest.raises(InputError) as error:
-        replay_log(pair_log, [Setting.parse(setting)])
-    assert says in str(error.value)
-    assert "\n" not in str(error.value)
-
-
-def test_a_setting_that_claims_a_joint_of_another_controller(pair_log: Path) -> None:
-    with pytest.raises(ControllerFault, match="pan"):
-        replay_log(pair_log, [Setting.parse("all_inputs.joints=[pan, nod]")])
-
-
-def test_a_limit_of_the_gate_from_an_argument(pair_log: Path) -> None:
-    report = replay_log(pair_log, (), {"speed": "0.8 rad/s"})
-    first = report.first
-    assert first is not None
-    assert (first.joint, first.controller) == ("pan", "head")
-    assert first.what.startswith("goal of the")
-    assert [(one.joint, one.commands) for one in report.joints if one.commands] == []
-
-
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
         ({"rate": "100"}, "change the loop's period from 20000000 ns to 10000000 ns"),
         ({"sped": "1 rad/s"}, "sped"),
         ({"speed": "fast"}, "pair.yaml:"),
     ],
 )
-def test_arguments_that_do_not_fit(pair_log: Path, arguments: dict[str, str], says: str) -> None:
+def test_setting_or_argument_that_does_not_fit_is_one_sentence(
+    pair_log: Path, wrong: str | dict[str, str], says: str
+) -> None:
+    settings, arguments = ([wrong], {}) if isinstance(wrong, str) else ([], wrong)
     with pytest.raises(InputError) as error:
-        replay_log(pair_log, (), arguments)
+        replay_log(pair_log, [*map(Setting.parse, settings)], arguments)
     assert says in str(error.value)
     assert "replay-" not in str(error.value)
+    if isinstance(wrong, str):
+        assert "\n" not in str(error.value)
+
+
+def test_setting_that_claims_a_joint_of_another_controller(pair_log: Path) -> None:
+    with pytest.raises(ControllerFault, match="pan"):
+        replay_log(pair_log, [Setting.parse("all_inputs.joints=[pan, nod]")])
 
 
 @pytest.fixture
 def log_with_include(robot_file: Path, tmp_path: Path) -> Path:
     """The robot's log, whose controllers stood in a file above the robot's directory."""
     head, tail = robot_file.read_text().split("controllers:\n")
-    robot, controllers, log = (
-        tmp_path / name for name in ("robots/pair.yaml", "controllers.yaml", "run.mcap")
-    )
+    robot, controllers, log = (tmp_path / n for n in ("robots/pair.yaml", "controllers.yaml", "run.mcap"))
     robot.parent.mkdir()
     robot.write_text(f"include: [../controllers.yaml]\n{head}")
     controllers.write_text(f"controllers:\n{tail}")
@@ -185,7 +176,7 @@ def test_included_files_and_the_urdf_come_from_the_log(log_with_include: Path, t
     assert replay_log(torso, (), {"rate": "50"}).same
 
 
-def test_a_file_outside_of_the_robots_directory_is_not_written(
+def test_file_outside_of_the_robots_directory_is_not_written(
     log_with_include: Path, changed: Changed, tmp_path: Path
 ) -> None:
     target = tmp_path / "written.yaml"
@@ -196,7 +187,194 @@ def test_a_file_outside_of_the_robots_directory_is_not_written(
     assert not target.exists()
 
 
-def test_a_plan_that_the_file_no_longer_gives(pair_log: Path, changed: Changed) -> None:
+def test_plan_that_the_file_no_longer_gives(pair_log: Path, changed: Changed) -> None:
     log = changed(pair_log, plan(lambda content: content["loop"]["joints"][1].update(upper=0.5)))
     with pytest.raises(InputError, match="now compiles to a different plan"):
         replay_log(log, (), {"speed": "5 rad/s"})
+
+
+# Messages of topics
+
+
+def flip_message(index: int, at: int, bit: int = 0) -> Change:
+    """Flip a bit of a message."""
+
+    def edit(found: list[tuple[int, bytes]]) -> None:
+        t_ns, data = found[index][0], bytearray(found[index][1])
+        data[at] ^= 1 << bit
+        found[index] = (t_ns, bytes(data))
+
+    return messages(STATE, edit)
+
+
+def test_messages_from_activation_to_deactivation_are_the_same(pair_log: Path, changed: Changed) -> None:
+    assert len(read_log(pair_log).topics[STATE].data) == 52
+    report = replay_log(pair_log)
+    assert report.same
+    assert report.messages >= 52
+    assert report.sentence == "pair: 50 cycles replayed, 0 differences"
+    without = replay_log(changed(pair_log, lambda log: replace(log, topics={})))
+    assert (without.same, without.messages) == (True, 0)
+
+
+@pytest.mark.parametrize(
+    ("index", "at", "cycle", "field"),
+    [
+        (0, 4, -1, "header.stamp.sec"),
+        (1, 20, 0, "number"),
+        (30, -8, 29, "sum[1]"),
+        (51, -16, 49, "sum[0]"),
+    ],
+)
+def test_one_bit_of_one_message_is_named(  # noqa: PLR0917  fixtures, and a case
+    pair_log: Path, changed: Changed, index: int, at: int, cycle: int, field: str
+) -> None:
+    report, first = differing(changed(pair_log, flip_message(index, at)))
+    assert (report.different, report.different_messages) == (0, 1)
+    assert (first.cycle, first.what) == (cycle, f"message of {STATE}: {field}")
+    assert first.recorded != first.replayed
+    assert report.sentence == f"pair: 50 cycles replayed, 1 of {report.messages} messages differs"
+
+
+def test_first_of_two_and_the_command_of_its_cycle_count(pair_log: Path, changed: Changed) -> None:
+    changes = flip_message(21, -8), flip_message(11, -8), add("command_position", (10, 1), 1.0)
+    report, first = differing(changed(pair_log, *changes))
+    assert (first.cycle, first.what) == (10, "command of the position")
+    assert report.different_messages == 2
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (lambda found: found.pop(7), (6, "no message", "a message")),
+        (lambda found: found.insert(7, found[7]), (6, "a message", "no message")),
+        (lambda found: found.append(found[-1]), (49, "a message", "no message")),
+    ],
+    ids=["one less", "one more", "one more at the end"],
+)
+def test_message_in_one_of_the_two_only_is_a_difference(
+    pair_log: Path, changed: Changed, change: Callable[[Any], None], expected: tuple[int, str, str]
+) -> None:
+    report, first = differing(changed(pair_log, messages(STATE, change)))
+    assert report.different_messages == 1
+    assert (first.cycle, first.recorded, first.replayed) == expected
+
+
+def test_messages_that_the_recorder_lost_are_a_remark(run: Callable[..., Path]) -> None:
+    def before(robot: VirtualRobot) -> None:
+        ring, dropped = robot.sinks.messages, []
+
+        class Lossy:
+            announce = staticmethod(ring.announce)
+
+            @staticmethod
+            def message(topic: int, t_ns: int, data: bytes) -> None:
+                dropped.append(t_ns)
+                if len(dropped) == 8:
+                    robot._writer.gap("loop/messages", 4)
+                if not 5 <= len(dropped) < 9:
+                    ring.message(topic, t_ns, data)
+
+        for managed in robot.robot.manager._managed:
+            for publisher in managed._topics._publishers.values():
+                publisher._sink = Lossy()
+
+    report = replay_log(run(before))
+    assert report.same
+    assert "the log lacks 4 messages of topics" in report.remarks
+
+
+def test_what_is_shown_of_a_message_is_one_sentence(
+    pair_log: Path, changed: Changed, capsys: pytest.CaptureFixture[str]
+) -> None:
+    report, _ = differing(changed(pair_log, flip_message(30, -1, 7)))
+    show_parts(*dxlrun_lab.commands.replay._replayed(report))
+    value = struct.unpack("<d", read_log(pair_log).topics[STATE].data[30][-8:])[0]
+    shown = f"message of {STATE}: sum[1]: recorded {-value!r}, replayed {value!r}"
+    assert capsys.readouterr().out.splitlines()[1] == f"first: cycle 29, 0.580 s, {shown}"
+
+
+# Prepared arrays: a `prepare` that makes something else of the same request is found out
+
+
+def prepare_otherwise(monkeypatch: pytest.MonkeyPatch, change: Callable[[Any], Any]) -> None:
+    """Let `prepare` of the trajectory controller return what `change` makes of its array."""
+    prepare = JointTrajectoryController.prepare
+    monkeypatch.setattr(
+        JointTrajectoryController, "prepare", staticmethod(lambda *of_it: change(prepare(*of_it)))
+    )
+
+
+def ask_often(robot: VirtualRobot) -> None:
+    """Hand over a command of a client every fifth cycle, and play the motion again at the end."""
+    plans = {one.name: one for one in robot.plan.loop.controllers}
+    preparation = Preparation({joint.name: joint for joint in robot.plan.loop.joints}, load_plugins())
+    waiting, record, drain = robot.inbox.waiting, robot.record, robot.inbox.drain_commands
+
+    def drain_asked() -> Any:
+        if record.cycle % 5 == 3 and record.cycle < 30:
+            body = msgspec.json.encode({"points": [{"time": 0.1, "positions": [0.01 * record.cycle]}]})
+            made = preparation.command(plans["head"], "trajectory", body)
+            waiting.append(CommandMessage(0, "head", "trajectory", made.data, "anna", request=made.request))
+        if record.cycle == 40:
+            compiled = {"head": preparation.compiled(structs.replace(plans["head"], active=True))}
+            motion = read_motion(Path(robot.plan.source_file).with_name("look.yaml"))
+            played = schedule_motion(motion, RunSnapshot(compiled, preparation.joints, record), 1.0)
+            waiting.append(CommandMessage(0, "", "play", played.data, "anna", request=played.request))
+        return drain()
+
+    robot.inbox.drain_commands = drain_asked  # type: ignore[method-assign]
+
+
+def test_commands_of_clients_and_motions_are_prepared_again(
+    run: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = run(ask_often)
+    report = replay_log(log)
+    assert report.same
+    assert (report.prepared, report.different_prepared, report.unprepared) == (8, 0, 0)
+
+    prepare_otherwise(monkeypatch, lambda array: np.append(array, 1.0))
+    report, first = differing(log)
+    assert (report.prepared, report.different_prepared) == (8, 8)
+    count = len(read_log(log).commands[0].numbers)
+    assert (first.cycle, first.recorded, first.replayed) == (3, f"{count} numbers", f"{count + 1} numbers")
+
+
+def refuse(array: object) -> None:
+    raise ValueError("no such motion any more")
+
+
+def test_another_array_of_the_plan_is_named(pair_log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert replay_log(pair_log).prepared == 1
+    with monkeypatch.context() as patch:
+        prepare_otherwise(patch, lambda array: array * 2)
+        report, first = differing(pair_log)
+        assert (report.prepared, report.different_prepared) == (1, 1)
+        assert (first.cycle, first.controller) == (10, "head")
+        assert first.time_s == pytest.approx(0.2)
+        assert first.what.startswith("prepared array of command trajectory, element ")
+        assert float(first.replayed) == 2 * float(first.recorded)
+    with monkeypatch.context() as patch:  # the last bit of one number far in the array: no goal need show it
+        prepare_otherwise(patch, lambda array: np.append(array[:-1], np.nextafter(array[-1:], np.inf)))
+        report, _ = differing(pair_log)
+        assert report.different_prepared == 1
+        assert report.different or "1 of 1 prepared command differs" in report.sentence
+    with monkeypatch.context() as patch:
+        prepare_otherwise(patch, refuse)
+        report, first = differing(pair_log)
+        assert (report.different_prepared, report.different) == (1, 0)  # the recorded array is handed on
+        assert first.replayed == "no array (ValueError: no such motion any more)"
+
+
+def test_request_that_the_log_does_not_have_is_reported(pair_log: Path, changed: Changed) -> None:
+    forget = plan(lambda content: [command.pop("request") for command in content["loop"]["commands"]])
+    report = replay_log(changed(pair_log, forget))
+    assert (report.same, report.prepared, report.unprepared) == (True, 0, 1)
+
+
+def test_request_is_left_out_where_there_is_no_room() -> None:
+    command = CommandMessage(7, "head", "positions", bytes(800), "anna", 5, b'{"positions":[1.0]}')
+    assert decode(encode_command(command)) == command
+    whole = len(encode_command(command))
+    assert decode(encode_command(command, whole - 1)) == structs.replace(command, request=b"")

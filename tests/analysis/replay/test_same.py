@@ -29,13 +29,20 @@ DXLRUN = Path(sys.executable).with_name("dxlrun")
 
 
 def motions_for(robot: Path) -> list[Path]:
-    """Return the motion that fits a robot, if there is one."""
+    """Return the motion that fits a robot, if there is one: it names its controllers."""
+    text = robot.read_text()
     for motion in sorted((ROBOTS / "motions").glob("*.yaml")):
+        names = {
+            line.split("controller:")[1].strip()
+            for line in motion.read_text().splitlines()
+            if "controller:" in line
+        }
         try:
-            compile_files(robot, {}, [motion])
+            if all(f"{name}:" in text for name in names):
+                compile_files(robot, {}, [motion])
+                return [motion]
         except InputError:
             continue
-        return [motion]
     return []
 
 
@@ -51,38 +58,31 @@ def test_replay_of_each_robot_has_no_difference(robot: Path, tmp_path: Path, amo
     assert periods == round(seconds * 1e9 / read.period_ns)
 
 
-def test_the_small_robot_shows_every_kind_of_value(pair_log: Path) -> None:
+def test_small_robot_shows_every_kind_of_value(pair_log: Path) -> None:
     cycles = read_log(pair_log).cycles
     assert np.isnan(cycles["command_velocity"]).any()
     assert np.isfinite(cycles["command_velocity"][:, 2]).all()
     assert len(np.unique(cycles["command_position"][:, 2])) == len(cycles) == 50
-    report = replay_log(pair_log)
-    assert (report.compared, report.different) == (50, 0)
-    assert report.sentence == "pair: 50 cycles replayed, 0 differences"
 
 
-def test_a_silent_servo_and_periods_that_were_skipped(
+def test_silent_servo_and_periods_that_were_skipped(
     run: Callable[..., Path], changed: Callable[..., Path], robot_file: Path, tmp_path: Path
 ) -> None:
     robot = tmp_path / "fast.yaml"
     robot.write_text(robot_file.read_text().replace("default: 50,", "default: 200,").replace("25}", "50}"))
-    log = run(
-        lambda one: silence(one, (3, 7, 8), 300, 600), robot, duration_s=4.0
-    )  # a lost one is asked once a second
+    log = run(lambda one: silence(one, (3, 7, 8), 300, 600), robot, 4.0)  # a lost one is asked once a second
     cycles = read_log(log).cycles
     assert cycles["skipped"].sum() > 0
     assert not cycles["valid"].all()
     assert cycles["valid"][-1].all()
     assert replay_log(log).same
-
     late_after_the_read = edited(lambda cycles: cycles["read_ns"].__setitem__(..., cycles["woken_ns"]))
     assert replay_log(changed(log, late_after_the_read)).same
 
 
-def test_a_run_that_ended_by_a_fault(tmp_path: Path, robot_file: Path) -> None:
-    robot = tmp_path / "faulty.yaml"
+def test_run_that_ended_by_a_fault(tmp_path: Path, robot_file: Path) -> None:
+    robot, log = tmp_path / "faulty.yaml", tmp_path / "run.mcap"
     robot.write_text(robot_file.read_text().replace("[tilt, nod]", "[tilt, nod], give_up_after: 0.5"))
-    log = tmp_path / "run.mcap"
     result = simulated_robot(robot, duration_s=1.0, log=log).run()
     assert (result.reason, result.cycles) == ("fault", 27)
     report = replay_log(log)
@@ -98,7 +98,7 @@ def test_commands_from_outside_come_from_the_log(pair_log: Path, changed: Callab
     assert first.joint == "pan"
 
 
-def test_a_run_in_real_time(tmp_path: Path, robot_file: Path, plugin: Path) -> None:
+def test_run_in_real_time(tmp_path: Path, robot_file: Path, plugin: Path) -> None:
     environment = os.environ | {"PYTHONPATH": f"{plugin}:{os.environ.get('PYTHONPATH', '')}"}
 
     def dxlrun(*words: str) -> subprocess.CompletedProcess[str]:
@@ -110,9 +110,8 @@ def test_a_run_in_real_time(tmp_path: Path, robot_file: Path, plugin: Path) -> N
     ran = dxlrun(str(robot_file), "--play", str(motion), "--duration", "1.5", "--no-gateway")
     logs = list((tmp_path / "logs").glob("*.mcap"))  # how the run went is not judged: machines are busy
     assert len(logs) == 1, ran.stdout + ran.stderr
-    (log,) = logs
-    cycles = read_log(log).cycles
+    cycles = read_log(logs[0]).cycles
     assert len(cycles) > 0, ran.stderr
-    told = dxlrun("replay", str(log))
+    told = dxlrun("replay", str(logs[0]))
     assert told.returncode == 0, told.stdout + told.stderr
     assert told.stdout == f"pair: {len(cycles)} cycles replayed, 0 differences\n"

@@ -23,17 +23,13 @@ from dxlrun_analysis.replay import replay_log
 Changed = Callable[..., Path]
 
 
-def test_nothing_is_compared_behind_a_gap(pair_log: Path, changed: Changed) -> None:
+def test_nothing_is_compared_behind_a_gap_or_a_lost_command(pair_log: Path, changed: Changed) -> None:
     report = replay_log(changed(pair_log, without(*range(20, 25)), gaps=[("loop/cycles", 5)]))
     assert (report.cycles, report.compared, report.same) == (45, 20, True)
     assert report.stopped == (
         "the log lacks cycles between 20 and 24 (5 records of loop/cycles lost: overwritten or damaged "
-        "before reading); the state of the controllers is unknown from cycle 25 on, so "
-        "the comparison ends"
+        "before reading); the state of the controllers is unknown from cycle 25 on, so the comparison ends"
     )
-
-
-def test_nothing_is_compared_behind_a_lost_command(pair_log: Path, changed: Changed) -> None:
     report = replay_log(changed(pair_log, no_commands()))
     assert (report.compared, report.same) == (10, True)
     assert report.stopped.startswith("the log lacks a command of cycle 10")
@@ -51,40 +47,32 @@ def of_controller(name: str, **other: object) -> Change:
 
 NO_PLAN = "this dxlrun cannot read the plan in the log"
 BEGINNING = "needs the start of the run, but this log "
+CONTRACT = (
+    "the controllers of the run have contract 7, this dxlrun has contract 4; "
+    "replay the log with dxlrun version 9.1"
+)
+NOT_TEXT = plan_text((b'"main"', b'"m\xffin"'), (b'"robot":"pair"', b'"robot":"p\xffir"'))
 REFUSED: dict[str, tuple[Change, str]] = {
     "no first cycles": (only(slice(3, None)), f"{BEGINNING}begins with cycle 3; give the directory with all"),
     "no activation": (lambda log: replace(log, activation=None), f"{BEGINNING}has no /activation"),
     "no cycles": (only(slice(0)), "nothing to replay: "),
-    "another contract": (
-        versions(contract="7", dxlrun="9.1"),
-        "the controllers of the run have contract 7, this dxlrun has contract 4; "
-        "replay the log with dxlrun version 9.1",
-    ),
+    "another contract": (versions(contract="7", dxlrun="9.1"), CONTRACT),
     "no plan": (plan(None), "no attachment plan.json"),
     "a plan that is none": (plan(b'{"robot": 5}'), NO_PLAN),
-    "a plan that is not text": (
-        plan_text((b'"main"', b'"m\xffin"'), (b'"robot":"pair"', b'"robot":"p\xffir"')),
-        NO_PLAN,
-    ),
+    "a plan that is not text": (NOT_TEXT, NO_PLAN),
     "a plan that is too deep": (plan(b'{"x": ' + b"[" * 200_000), NO_PLAN),
-    "other joints": (
-        plan(lambda content: content["loop"]["joints"].pop()),
-        "plan and cycles differ in joints",
-    ),
+    "other joints": (plan(lambda plan: plan["loop"]["joints"].pop()), "plan and cycles differ in joints"),
     "other controllers": (
-        plan(lambda content: content["loop"]["controllers"].reverse()),
+        plan(lambda plan: plan["loop"]["controllers"].reverse()),
         "plan and cycles differ in controllers",
     ),
-    "no rate divider": (
-        of_controller("head", every=0),
-        "controller head of the plan has the rate divider 0",
-    ),
+    "no rate divider": (of_controller("head", every=0), "controller head of the plan has the rate divider 0"),
     "no such joint": (
         of_controller("head", joints=["neck"]),
         "controller head of the plan has the unknown joint neck",
     ),
     "no such command": (
-        plan(lambda content: content["loop"]["commands"].clear()),
+        plan(lambda plan: plan["loop"]["commands"].clear()),
         "the plan in the log lacks a command of cycle 10",
     ),
     "a deadline": (add("scheduled_ns", 30, 10**12), "contradict its number"),
@@ -102,7 +90,7 @@ def refused(log: Path, error: type[Exception] = LogError) -> str:
 
 
 @pytest.mark.parametrize("which", REFUSED)
-def test_a_log_that_cannot_be_replayed_is_one_sentence(pair_log: Path, changed: Changed, which: str) -> None:
+def test_log_that_cannot_be_replayed_is_one_sentence(pair_log: Path, changed: Changed, which: str) -> None:
     change, sentence = REFUSED[which]
     path = changed(pair_log, change)
     assert sentence in refused(path)
@@ -110,7 +98,7 @@ def test_a_log_that_cannot_be_replayed_is_one_sentence(pair_log: Path, changed: 
         assert joints_of(read_log(path)) == {}
 
 
-def test_a_missing_plug_in_and_parameters_that_the_installed_one_refuses(
+def test_missing_plug_in_and_parameters_that_the_installed_one_refuses(
     pair_log: Path, changed: Changed
 ) -> None:
     path = changed(pair_log, of_controller("all_inputs", type="gone"))
@@ -128,10 +116,8 @@ def test_other_versions_are_named(pair_log: Path, changed: Changed) -> None:
     older = plan_text((b"all-inputs 1.0", b"all-inputs 0.9"))
     numpy, plugin = replay_log(changed(pair_log, versions(numpy="1.0"), older)).remarks
     assert numpy == f"numpy has version 1.0 in the run and {np.__version__} in the replay"
-    assert plugin == (
-        "the controller type all_inputs came from all-inputs 0.9 in the run and comes from all-inputs 1.0 "
-        "in the replay"
-    )
+    came = "came from all-inputs 0.9 in the run and comes from all-inputs 1.0 in the replay"
+    assert plugin == f"the controller type all_inputs {came}"
 
 
 def test_parts_are_replayed_from_the_first_one_only(
@@ -153,14 +139,11 @@ def test_parts_are_replayed_from_the_first_one_only(
         assert f"a replay {BEGINNING}begins with cycle 1" in sentence
 
 
-def test_a_log_that_ends_by_a_kill(tmp_path: Path, pair_log: Path) -> None:
-    data = pair_log.read_bytes()
-    log = tmp_path / "killed.mcap"
+def test_log_that_ends_by_a_kill(tmp_path: Path, pair_log: Path) -> None:
+    data, log = pair_log.read_bytes(), tmp_path / "killed.mcap"
     log.write_bytes(data[: data.index(b"dxlrun_summary") - 13])
     assert not read_log(log).complete
     report = replay_log(log)
     assert (report.compared, report.same) == (50, True)
-    assert report.remarks == (
-        "the file ends early: the recorder was killed or could not write; its last cycle is at 1.0 s of "
-        "the run",
-    )
+    early = "the file ends early: the recorder was killed or could not write"
+    assert report.remarks == (f"{early}; its last cycle is at 1.0 s of the run",)

@@ -372,7 +372,7 @@ def kick(story: Story, t_s: float, joint: str, speed: float, period_s: float) ->
     shaft.mechanics._wake()
 
 
-@line("<joint> gets a bag of <n> Nm", then)
+@line("<joint> has a bag of <n> Nm to carry", then)
 def hang_a_bag(story: Story, joint: str, torque: float) -> None:
     shaft = story.servo(joint).shaft
     plant, index = shaft.mechanics.plant, shaft.index
