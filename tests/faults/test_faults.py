@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import time
 from pathlib import Path
 
@@ -120,6 +121,7 @@ def test_functions_that_are_in_use_get_the_fault(
     product = loaded(path)
     joint, count = product.Joint(), product.counter()
     seen = [count()]
+    gc.freeze()  # as commands do
     assert trials.load(path, PRODUCT, PRODUCT.replace(old, new))
     before, joint.goal = joint.goal, 5
     assert (before, joint.goal) == goals

@@ -84,6 +84,7 @@ def load(path: Path, right: str, wrong: str) -> bool:
     if [name for name, _, _ in rights] != [name for name, _, _ in wrongs]:
         return False
     codes = {(name, line): code for (name, line, _), (_, _, code) in zip(rights, wrongs, strict=True)}
+    gc.unfreeze()  # get_objects does not list what is frozen
     for function in filter(inspect.isfunction, gc.get_objects()):
         old = function.__code__
         new = codes.get((old.co_qualname, old.co_firstlineno)) if old.co_filename == str(path) else None
