@@ -7,6 +7,7 @@ import time
 from pathlib import Path
 
 import pytest
+from coverage import CoverageData
 from tests.faults import faults, trials
 from tests.faults.faults import Fault
 from tests.kit.loaded import loaded
@@ -136,14 +137,24 @@ def test_functions_that_are_in_use_get_the_fault(
         ("def goal(self, goal):", "def goal(self, goal=0):", False),
     ],
 )
-def test_fault_outside_of_functions_needs_a_pytest_of_its_own(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, old: str, new: str, can: bool
+def test_fault_outside_of_functions_needs_a_pytest_of_its_own(old: str, new: str, can: bool) -> None:
+    assert trials.is_loadable("product.py", PRODUCT, PRODUCT.replace(old, new)) is can
+
+
+def test_tests_that_execute_a_faulty_function_are_those_of_coverage(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(faults, "ROOT", tmp_path)
+    monkeypatch.setattr(trials, "ROOT", tmp_path)
     (tmp_path / "product.py").write_text(PRODUCT)
-    lines = next(line for line in PRODUCT.splitlines() if old in line)
-    fault = Fault("product.py", "wrong", lines, lines.replace(old, new), "")
-    assert trials.is_loadable(fault) is can
+    covered = CoverageData(no_disk=True)
+    for line, name in ((7, "goal[a|b]|run"), (11, "angle|setup"), (17, "count|run"), (1, "")):
+        covered.set_context(f"tests/test_x.py::{name}" if name else "")
+        covered.add_lines({str(tmp_path / "product.py"): [line]})
+    fault = Fault("product.py", "it counts twice", "        number += 1", "        number += 2", "")
+    assert trials.trial_of(fault, covered).executing == {"tests/test_x.py::count"}
+    fault = Fault("product.py", "the angle", "        return self.angle", "        return 0", "")
+    assert trials.trial_of(fault, covered).executing == {"tests/test_x.py::goal[a|b]"}
 
 
 def test_what_takes_too_long_finds_nothing() -> None:

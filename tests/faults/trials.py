@@ -1,9 +1,13 @@
-"""Trials: the tests of a room run for each fault, in a process of its own, until one of them fails.
+"""Trials: tests run for each fault, in a process of its own, until one of them fails.
 
-pytest collects the tests of a room once. For each fault a copy of that process (fork) gives the functions of
-the faulty file their new code; what tests start themselves reads the faulty file. A fault in C, or outside of
-functions, has a pytest of its own. What takes longer than the limit has not found the fault: a test that
-nobody waits for finds nothing.
+    pytest --cov --cov-context=test --cov-report=    # once: .coverage has the tests that execute each line
+    python tests/faults/faults.py --try control.txt
+
+First run the tests that execute a function of the fault in the process of pytest, then the others of its
+room, and those that name its module. pytest collects them once; for each fault a copy of that process (fork)
+gives the functions of the faulty file their new code, and what tests start themselves reads the faulty file.
+A fault in C, or outside of functions, has a pytest of its own. A test that fails without the fault too has
+not found it, and what takes longer than the limit finds nothing: nobody would wait for it.
 """
 
 from __future__ import annotations
@@ -18,19 +22,21 @@ import re
 import signal
 import subprocess
 import sys
-from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from contextlib import nullcontext
+from functools import cache, partial
 from multiprocessing.connection import Connection
 from pathlib import Path
 from types import CodeType
+from typing import NamedTuple
 
 import pytest
+from coverage import CoverageData
 from tests.faults import faults
 from tests.faults.faults import ROOT, Fault
 from tests.kit import selection
 
-LIMIT_S = 240.0
+LIMIT_S = 120.0
 FORK = multiprocessing.get_context("fork")
 NOT_LOADED = "not loaded"
 
@@ -40,15 +46,60 @@ def tests_of(path: str) -> list[str]:
     module = selection.module_of(path)
     parent, _, name = module.rpartition(".")
     names = re.compile(rf"\b({re.escape(module)}|from {re.escape(parent)} import .*\b{re.escape(name)})\b")
-    long = {name for name, _ in selection.long_files()}
-    files = [
-        file for file in sorted(ROOT.glob("tests/**/test_*.py")) if str(file.relative_to(ROOT)) not in long
-    ]
-    naming = [file for file in files if names.search(file.read_text("utf-8"))]
     folders = [ROOT / "tests" / folder for folder in selection.tests_of(selection.room_of(module))]
+    files = short_files()
     in_room = [file for folder in folders for file in files if file.is_relative_to(folder)]
+    naming = [file for file, text in files.items() if names.search(text)]
     in_room.sort(key=lambda file: file not in naming)
     return [str(file.relative_to(ROOT)) for file in dict.fromkeys([*in_room, *naming])]
+
+
+@cache
+def short_files() -> dict[Path, str]:
+    """Return the files of short tests with their texts."""
+    long = {name for name, _ in selection.long_files()}
+    files = sorted(ROOT.glob("tests/**/test_*.py"))
+    return {file: file.read_text("utf-8") for file in files if str(file.relative_to(ROOT)) not in long}
+
+
+class Trial(NamedTuple):
+    """A fault, and what decides which tests run for it."""
+
+    fault: Fault
+    right: str
+    """The file without the fault."""
+    wrong: str
+    """The file with the fault."""
+    executing: frozenset[str]
+    """Tests that execute a function of the fault in the process of pytest."""
+
+    @property
+    def files(self) -> list[str]:
+        """The test files that run, most likely ones first."""
+        own = tests_of(self.fault.path)
+        return [*own, *sorted({name.partition("::")[0] for name in self.executing} - {*own})]
+
+    def chosen(self, items: Sequence[pytest.Item]) -> list[pytest.Item]:
+        """Return the tests that run, most likely ones first."""
+        own = {*tests_of(self.fault.path)}
+        ranks = {file: rank for rank, file in enumerate(self.files)}
+        by_file = [(item.nodeid.partition("::")[0], item) for item in items]
+        chosen = [(file, item) for file, item in by_file if file in own or item.nodeid in self.executing]
+        chosen.sort(key=lambda one: (one[1].nodeid not in self.executing, ranks[one[0]]))
+        return [item for _, item in chosen]
+
+
+def trial_of(fault: Fault, covered: CoverageData) -> Trial:
+    """Return the trial of a fault."""
+    right, wrong = faults.texts_of(fault)
+    lines: set[int] = set()
+    if is_loadable(fault.path, right, wrong):
+        codes, changed = ({*functions_of(compile(text, fault.path, "exec"))} for text in (right, wrong))
+        kept = {code for _, _, code in changed}
+        lines = {line for _, _, code in codes if code not in kept for *_, line in code.co_lines() if line}
+    by_line = covered.contexts_by_lineno(str(ROOT / fault.path))
+    names = {name.rpartition("|")[0] for line in lines for name in by_line.get(line, ())}
+    return Trial(fault, right, wrong, frozenset(names - {""}))
 
 
 def functions_of(code: CodeType) -> Iterator[tuple[str, int, CodeType]]:
@@ -68,12 +119,9 @@ def outside_functions(text: str) -> str:
     return ast.dump(tree)
 
 
-def is_loadable(fault: Fault) -> bool:
+def is_loadable(path: str, right: str, wrong: str) -> bool:
     """Return whether a fault is in bodies of Python functions only."""
-    if not fault.path.endswith(".py"):
-        return False
-    right, wrong = faults.texts_of(fault)
-    return outside_functions(right) == outside_functions(wrong)
+    return path.endswith(".py") and outside_functions(right) == outside_functions(wrong)
 
 
 def load(path: Path, right: str, wrong: str) -> bool:
@@ -95,41 +143,35 @@ def load(path: Path, right: str, wrong: str) -> bool:
     return True
 
 
-class Trial:
-    """Plugin: runs the collected tests for each fault, and reports the first that fails."""
+class Trials:
+    """Plugin: runs the collected tests for each fault, and sends the first that fails."""
 
-    def __init__(self, tried: Sequence[Fault], results: Connection, *, is_present: bool) -> None:
-        self._faults = tried
+    def __init__(self, trials: Sequence[Trial], results: Connection, *, is_present: bool) -> None:
+        self._trials = trials
         self._results = results
         self._is_present = is_present
 
     @pytest.hookimpl(tryfirst=True)
     def pytest_runtestloop(self, session: pytest.Session) -> bool:
         """Run the tests in a copy of this process for each fault."""
-        by_file = defaultdict(list)
-        for item in session.items:
-            by_file[item.nodeid.partition("::")[0]].append(item)
-        failing: list[str] = []
-        if not self._is_present:
-            failing = in_copy(partial(failures, session, session.items, most=None), limit_s=4 * LIMIT_S)
-        for fault in self._faults:
-            passing = [
-                item for file in tests_of(fault.path) for item in by_file[file] if item.nodeid not in failing
-            ]
-            if self._is_present:
-                found = in_copy(partial(failures, session, passing, most=1))
-            else:
-                texts = faults.texts_of(fault)
-                with faults.applied(fault):
-                    found = in_copy(partial(self._failures_with, session, passing, fault.path, texts))
+        for trial in self._trials:
+            items = trial.chosen(session.items)
+            while True:
+                with nullcontext() if self._is_present else faults.applied(trial.fault):
+                    found = in_copy(partial(self._failure_of, session, items, trial))
+                alone = [item for item in items if item.nodeid in found]
+                if self._is_present or not alone or not in_copy(partial(failures, session, alone)):
+                    break
+                items.remove(alone[0])  # it fails without the fault too
             self._results.send(found)
         return True
 
-    def _failures_with(
-        self, session: pytest.Session, items: Sequence[pytest.Item], path: str, texts: tuple[str, str]
-    ) -> list[str]:
-        """Load the faulty text of a file, and return the first test that fails."""
-        return failures(session, items, most=1) if load(ROOT / path, *texts) else [NOT_LOADED]
+    def _failure_of(self, session: pytest.Session, items: Sequence[pytest.Item], trial: Trial) -> list[str]:
+        """Return the first test that fails with a fault in this process."""
+        path = ROOT / trial.fault.path
+        if not self._is_present and not load(path, trial.right, trial.wrong):
+            return [NOT_LOADED]
+        return failures(session, items)
 
 
 def in_copy(function: Callable[[], list[str]], limit_s: float = LIMIT_S) -> list[str]:
@@ -154,8 +196,8 @@ def in_copy(function: Callable[[], list[str]], limit_s: float = LIMIT_S) -> list
         os.waitpid(copy, 0)
 
 
-def failures(session: pytest.Session, items: Sequence[pytest.Item], *, most: int | None) -> list[str]:
-    """Run tests, until as many have failed; return those that failed."""
+def failures(session: pytest.Session, items: Sequence[pytest.Item]) -> list[str]:
+    """Run tests until one fails; return it."""
     failed: list[str] = []
 
     class Reports:
@@ -166,35 +208,35 @@ def failures(session: pytest.Session, items: Sequence[pytest.Item], *, most: int
     session.config.pluginmanager.register(Reports())
     for item, following in itertools.zip_longest(items, items[1:]):
         item.config.hook.pytest_runtest_protocol(item=item, nextitem=following)
-        if len(failed) == most:
+        if failed:
             session._setupstate.teardown_exact(None)
             break
     return failed
 
 
-def run_session(tried: Sequence[Fault], results: Connection, *, is_present: bool) -> None:
+def run_session(trials: Sequence[Trial], results: Connection, *, is_present: bool) -> None:
     """Collect and run the tests of faults in this process, without a word."""
     with open(os.devnull, "w") as nowhere:
         os.dup2(nowhere.fileno(), 1)
         os.dup2(nowhere.fileno(), 2)
     words = ["-q", "-n", "0", "-p", "no:cacheprovider", "--timeout=120"]
     words += ["-W", "ignore::pytest.PytestAssertRewriteWarning"]  # of plugins that this program has imported
-    files = sorted({file for fault in tried for file in tests_of(fault.path)})
-    pytest.main([*words, *files], plugins=[Trial(tried, results, is_present=is_present)])
+    files = dict.fromkeys(file for trial in trials for file in trial.files if (ROOT / file).is_file())
+    pytest.main([*words, *files], plugins=[Trials(trials, results, is_present=is_present)])
 
 
-def results_of(group: Sequence[Fault], *, is_present: bool) -> Iterator[Fault]:
-    """Yield faults of one room with their results."""
+def results_of(trials: Sequence[Trial], *, is_present: bool) -> Iterator[Fault]:
+    """Yield faults with their results."""
     answer, results = FORK.Pipe(duplex=False)
-    session = FORK.Process(target=run_session, args=(group, results), kwargs={"is_present": is_present})
+    session = FORK.Process(target=run_session, args=(trials, results), kwargs={"is_present": is_present})
     session.start()
     results.close()
-    for fault in group:
+    for trial in trials:
         try:
             found = answer.recv()
         except EOFError:  # pytest ended before its tests: the fault shows when they are collected
             found = ["collection of the tests" if is_present else NOT_LOADED]
-        yield fault._replace(result=f"found by: {found[0]}" if found else "not found")
+        yield trial.fault._replace(result=f"found by: {found[0]}" if found else "not found")
     session.join()
 
 
@@ -206,24 +248,25 @@ def build() -> None:
 
 def tried(untried: Sequence[Fault]) -> Iterator[Fault]:
     """Yield faults with their results."""
-    groups = defaultdict(list)
+    covered = CoverageData(str(ROOT / ".coverage"))
+    covered.read()
     alone = []
-    for fault in untried:
-        room = selection.room_of(selection.module_of(fault.path))
-        (groups[room] if is_loadable(fault) else alone).append(fault)
-    for group in groups.values():
-        for fault in results_of(group, is_present=False):
-            if fault.result == f"found by: {NOT_LOADED}":
-                alone.append(fault._replace(result=""))
-            else:
-                yield fault
-    for fault in alone:
-        is_compiled = fault.path.endswith(".c")
+    loadable = []
+    for trial in (trial_of(fault, covered) for fault in untried):
+        can = is_loadable(trial.fault.path, trial.right, trial.wrong)
+        (loadable if can else alone).append(trial)
+    for trial, fault in zip(loadable, results_of(loadable, is_present=False), strict=True):
+        if fault.result == f"found by: {NOT_LOADED}":
+            alone.append(trial)
+        else:
+            yield fault
+    for trial in alone:
+        is_compiled = trial.fault.path.endswith(".c")
         try:
-            with faults.applied(fault):
+            with faults.applied(trial.fault):
                 if is_compiled:
                     build()
-                yield from results_of([fault], is_present=True)
+                yield from results_of([trial], is_present=True)
         finally:
             if is_compiled:
                 build()
