@@ -125,6 +125,15 @@ def test_controller_of_another_package_is_compiled_and_played():
 
 
 @pytest.mark.usefixtures("foreign_plugins")
+def test_its_topics_are_in_the_plan_and_none_is_that_of_a_bus():
+    text = FOREIGN.replace("foreign", "publishing")
+    (controller,) = compile_text(text).plan.loop.controllers
+    assert controller.topics == ("/mine/main",)
+    (problem,) = problems_in(text.replace("mine:", "bus:"))
+    assert (problem.what, problem.fix) == ("/bus/main is the topic of a bus", "rename controller bus")
+
+
+@pytest.mark.usefixtures("foreign_plugins")
 @pytest.mark.parametrize(
     "entry",
     [

@@ -1,7 +1,10 @@
+"""The page of robot files and the schema say what the program does; marks are the places of values."""
+
 from __future__ import annotations
 
 import json
 import re
+from collections.abc import Iterator
 
 import pytest
 from tests.kit import desk
@@ -9,38 +12,33 @@ from tests.kit.pages import page_text
 
 from dxlrun.cli.examples import schema_text
 from dxlrun.description.base_form import Form
-from dxlrun.description.bus import Adapter, Bus, BusSimulation, SlowRegisters
-from dxlrun.description.joints.joint_forms import Joint, JointSimulation, SharedJoint
-from dxlrun.description.joints.joint_mechanics import (
-    GoalTolerance,
-    Limits,
-    OneOfServos,
-    SharedTolerance,
-)
-from dxlrun.description.joints.motor_file import MotorForm, read_motor
-from dxlrun.description.motion import Formula, FormulaPart, MotionForm, Point, PointsPart, Target
-from dxlrun.description.robot import (
-    ControllerEntry,
-    Gateway,
-    GroupPolicies,
-    Loop,
-    Policies,
-    PoseStep,
-    RobotModel,
-    Scheduler,
-    Simulation,
-    TorqueStep,
-    robot_form,
-)
-from dxlrun.features.devices.form import Device, DeviceSimulation
-from dxlrun.features.mechanics.form import Transmission, TransmissionServo
-from dxlrun.features.recording.form import Recording
-from dxlrun.features.sensors.form import SensorEntry
+from dxlrun.description.document import Marks
+from dxlrun.description.joints.motor_file import read_motor
+from dxlrun.description.motion import Formula, Target
+from dxlrun.description.robot import robot_form
+from dxlrun.errors import Mark
 
 PAGE = page_text("robot-file.md")
 EXAMPLES = re.findall(r"^```yaml\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
 TABLES = set(re.findall(r"^<!-- keys: (\w+) -->$", PAGE, re.MULTILINE))
 """Sections whose tables docs/generate.py writes."""
+WITHOUT_TABLE = {
+    "Argument", "BareJoint", "Formula", "Group", "LoadForm", "MotionForm", "MotorForm", "PlugInEntry",
+    "Point", "Processes", "Robot", "ServoEntry", "ServoJoint", "SharedJoint", "StribeckForm", "Target",
+    "UncertaintyForm",
+}  # fmt: skip
+"""Forms that another table, or the text of the page, describes."""
+
+
+def forms(kind: type[Form]) -> Iterator[type[Form]]:
+    """Yield all forms of the program that are made of one."""
+    for below in kind.__subclasses__():
+        if below.__module__.startswith(("dxlrun.description.", "dxlrun.features.")):
+            yield below
+        yield from forms(below)
+
+
+FORMS = {robot_form(), *forms(Form)}
 
 
 def test_the_examples_of_the_page_are_read() -> None:
@@ -54,55 +52,18 @@ def test_the_examples_of_the_page_are_read() -> None:
     without = robot[: robot.index("controllers:")]
     assert desk.robot(without + chain).robot.controllers["arm"].into == ("arm_pid",)
     head = robot[: robot.index("joints:")]
-    for example, joint in (
-        (groups, "left_elbow"),
-        (near, "elbow"),
-        (slide, "gripper"),
-        (shared, "hip"),
-        (wrist, "wrist_roll"),
-    ):
-        assert joint in desk.robot(head + example).robot.joints
+    moved = {groups: "left_elbow", near: "elbow", slide: "gripper", shared: "hip", wrist: "wrist_roll"}
+    joints = [set(desk.robot(head + example).robot.joints) for example in moved]
+    assert [joint in found for joint, found in zip(moved.values(), joints, strict=True)] == [True] * 5
     assert len(desk.motion(motion).motion.motions) == 2
     assert read_motor(desk.write(motor, "elbow.motor.yaml")).motor.p_gain == 32
 
 
-PARTS = [
-    *(
-        Bus,
-        Adapter,
-        SlowRegisters,
-        BusSimulation,
-        Joint,
-        Limits,
-        GoalTolerance,
-        SharedTolerance,
-        OneOfServos,
-        Transmission,
-        TransmissionServo,
-    ),
-    *(JointSimulation, Loop, Scheduler, Policies, PoseStep, TorqueStep, GroupPolicies, ControllerEntry),
-    *(
-        SensorEntry,
-        Device,
-        DeviceSimulation,
-        Recording,
-        Gateway,
-        RobotModel,
-        Simulation,
-        PointsPart,
-        FormulaPart,
-    ),
-]
-
-
-def test_every_part_has_a_table() -> None:
-    assert {part.__name__ for part in PARTS} | {"robot", "motor"} == TABLES
-
-
-@pytest.mark.parametrize("part", [*PARTS, robot_form(), SharedJoint, MotorForm, MotionForm, Point, Target])
-def test_every_key_is_described(part: type[Form]) -> None:
-    for key, field in part.model_fields.items():
-        assert field.description, key
+def test_every_form_has_a_table_and_every_key_a_description_and_an_example() -> None:
+    assert {one.__name__ for one in FORMS} - WITHOUT_TABLE == TABLES - {"robot", "motor"}
+    fields = [(one, key, field) for one in FORMS for key, field in one.model_fields.items()]
+    assert [(one, key) for one, key, field in fields if not field.description] == []
+    assert {key for _, key, field in fields if not field.examples} == {"parameters"}
 
 
 @pytest.mark.parametrize(
@@ -115,19 +76,29 @@ def test_every_key_is_described(part: type[Form]) -> None:
     ],
 )
 def test_a_default_of_the_schema_is_that_of_the_program(part: str, key: str) -> None:
-    written = json.loads(schema_text("robot"))["$defs"][part]["properties"][key]["default"]
-    keys = {"Bus": f"{key}: {written}", "Adapter": f"adapter: {{{key}: {written}}}"}.get(
-        part, "baud_rate: 57600"
-    )
+    value = json.loads(schema_text("robot"))["$defs"][part]["properties"][key]["default"]
+    written = {
+        "Bus": ("57600", f"57600, {key}: {value}"),
+        "Adapter": ("57600", f"57600, adapter: {{{key}: {value}}}"),
+        "Policies": ("loop:", f"policies: {{{key}: {value}}}\nloop:"),
+    }
     robot = (
-        "name: x\nbuses:\n  m: {port: sim, protocol: 1.0, %s}\nloop: {rate: 1}\n"
+        "name: x\nbuses:\n  m: {port: sim, protocol: 1.0, baud_rate: 57600}\nloop: {rate: 1}\n"
         "joints: {j: {bus: m, id: 1, model: A, reference: 0 deg, direction: 1}}\n"
     )
-    bus = "baud_rate: 57600"
-    policies = f"policies: {{{key}: {written}}}\n" if part == "Policies" else ""
-    given = robot % (bus if keys == bus else f"{bus}, {keys}") + policies
-    assert desk.robot(given).robot == desk.robot(robot % bus).robot
+    given = robot.replace(*written[part])
+    assert given != robot
+    assert desk.robot(given).robot == desk.robot(robot).robot
 
 
 def test_targets_and_formulas_have_the_same_three_quantities() -> None:
     assert set(Target.model_fields) == set(Formula.model_fields) == {"position", "velocity", "acceleration"}
+
+
+def test_marks_are_those_of_the_nearest_parent_that_is_in_the_file() -> None:
+    at = {(): Mark("f", 2, 1), ("a",): Mark("f", 3, 3), ("a", 0): Mark("f", 3, 5)}
+    marks = Marks("f", values=at, keys={("a",): Mark("f", 2, 1)})
+    assert (marks.key("a"), marks.value("a")) == (Mark("f", 2, 1), Mark("f", 3, 3))
+    assert marks.key("a", 0) == marks.value("a", 0) == Mark("f", 3, 5)  # an item of a list has only a value
+    assert marks.value("a", 7, "x") == marks.key("nowhere") == Mark("f", 2, 1)
+    assert Marks("f", {}, {}).value("a") == Mark("f", 1, 1)

@@ -1,3 +1,4 @@
+# ruff: noqa: E501 (a file and its sentence are read best side by side)
 """Files of other programs that are given as robot files, or for other files: one sentence each."""
 
 from __future__ import annotations
@@ -15,16 +16,8 @@ CALIBRATION = (
     '{"pan": {"id": 1, "drive_mode": 0, "homing_offset": -1196, "range_min": 725, "range_max": 3449}}'
 )
 FOREIGN = [
-    (
-        "a.yaml",
-        "robot: {type: omx_follower, port: /dev/ttyACM0}",
-        "LeRobot; `dxlrun scan /dev/ttyACM0 --output",
-    ),
-    (
-        "a.yaml",
-        "robot: {type: so101_follower, port: /dev/ttyACM0}",
-        "LeRobot; use arms with Dynamixel servos",
-    ),
+    ("a.yaml", "robot: {type: omx_follower, port: /dev/ttyACM0}", "LeRobot; `dxlrun scan /dev/ttyACM0 --output"),
+    ("a.yaml", "robot: {type: so101_follower, port: /dev/ttyACM0}", "LeRobot; use arms with Dynamixel servos"),
     ("a.yaml", "teleop: {type: koch_leader, port: x, id: y}", "LeRobot; `dxlrun examples koch`"),
     ("a.yaml", "type: koch_follower\nport: /dev/ttyACM0\ncameras: {}", "a configuration of LeRobot"),
     ("a.json", CALIBRATION, "a calibration of LeRobot"),
@@ -38,13 +31,9 @@ FOREIGN = [
     ("a.mtn", "type=motion\nversion=1.01\npage_begin\nname=march\n", "a motion file of RoboPlus"),
     ("a.yaml", "pan: {ID: 1, Return_Delay_Time: 0}\ntilt: {ID: 2}", "dynamixel_workbench"),
     ("a.py", "# pan and tilt\nimport numpy as np\n", "a program in Python"),
-    (
-        "a.bag",
-        "#ROSBAG V2.0\nE\0\0\0",
-        "a ROS 1 bag; `rosbags-convert --src a.bag --dst a --dst-storage mcap`",
-    ),
+    ("a.bag", "#ROSBAG V2.0\nE\0\0\0", "a ROS 1 bag; `rosbags-convert --src a.bag --dst a --dst-storage mcap`"),
     ("a.db3", "SQLite format 3\0x", "a ROS 2 bag in SQLite"),
-]
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("name", "text", "said"), FOREIGN)
@@ -64,10 +53,9 @@ def test_a_file_of_another_program_is_one_problem_with_its_name(
 
 
 def test_a_log_as_robot_file_names_the_verbs_for_logs(tmp_path: Path) -> None:
-    path = tmp_path / "a.mcap"
-    path.write_bytes(b"\x89MCAP0\r\nxyz")
+    (tmp_path / "a.mcap").write_bytes(b"\x89MCAP0\r\nxyz")
     with pytest.raises(InputError, match=r"a recording in MCAP; `dxlrun analyze .*a\.mcap`"):
-        read_robot(path, {})
+        read_robot(tmp_path / "a.mcap", {})
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import pytest
 from tests.kit import desk
@@ -31,12 +30,8 @@ motions:
 
 def test_a_robot_file_is_no_motion_and_a_motion_no_robot() -> None:
     motion = "name: nod\nmotions:\n- {controller: c, points: [{time: 1 s, joints: {a: {position: 0 deg}}}]}\n"
-    folder = Path.cwd()
-
     assert desk.refusals(motion) == [
-        f"robot.yaml:2:1: this is a motion file, not a robot file; run it with `dxlrun ROBOT.yaml --play {folder}/robot.yaml`".replace(
-            f"{folder}/", ""
-        )
+        "robot.yaml:2:1: this is a motion file, not a robot file; run it with `dxlrun ROBOT.yaml --play robot.yaml`"
     ]
     assert desk.refusals("model: MX-64\ntorque_constant: 1.6 Nm/A\n") == [
         "robot.yaml:2:1: this is a motor file, not a robot file; name it in a robot file, at the joint: `motor: robot.yaml`"

@@ -102,18 +102,9 @@ def test_data_without_a_file_is_reported_at_its_top() -> None:
 
 
 JOINTS = (
-    "left_ankle_pitch",
-    "left_ankle_roll",
-    "left_elbow",
-    "left_wrist",
-    "right_elbow",
-    "front_left_hip",
-    "LKnee",
-    "joint_1",
-    "joint_2",
-    "head_yaw_joint",
-    "pan",
-)
+    "left_ankle_pitch", "left_ankle_roll", "left_elbow", "left_wrist", "right_elbow", "front_left_hip", "LKnee",
+    "joint_1", "joint_2", "head_yaw_joint", "pan",
+)  # fmt: skip
 
 
 @pytest.mark.parametrize(

@@ -33,18 +33,12 @@ def test_a_value_is_replaced_in_a_mapping_in_a_list_and_where_an_argument_stands
     replacements = [
         Replacement(("joints", "joint", "limits", "position", 1), "1 rad"),
         Replacement(("loop", "rate"), 80),
+        Replacement(("joints", "joint", "registers", "d_gain"), 8),  # the file has none
     ]
-    description = read_robot(robot, {}, replacements)
-    assert description.robot.joints["joint"].limits.position == (pytest.approx(-1.5707963267948966), 1.0)
-    assert description.robot.loop.rate == 80.0
-    untouched = read_robot(robot, {})
-    assert untouched.robot.loop.rate == 50.0
-
-
-def test_a_value_is_put_where_the_file_has_none(robot: Path) -> None:
-    place: KeyPath = ("joints", "joint", "registers", "d_gain")
-    description = read_robot(robot, {}, [Replacement(place, 8)])
-    assert description.robot.joints["joint"].registers == {"d_gain": 8}
+    found, untouched = read_robot(robot, {}, replacements).robot, read_robot(robot, {}).robot
+    assert found.joints["joint"].limits.position == (pytest.approx(-1.5707963267948966), 1.0)
+    assert found.joints["joint"].registers == {"d_gain": 8}
+    assert (found.loop.rate, untouched.loop.rate) == (80.0, 50.0)
 
 
 @pytest.mark.parametrize(
