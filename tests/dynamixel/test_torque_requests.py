@@ -182,33 +182,6 @@ def test_torque_off_that_was_not_heard_is_written_again_and_one_that_is_never_he
     assert arm.told(arm.switch(False)).endswith("did not confirm torque off; dxlrun sends it again")
 
 
-def test_off_and_on_twice_is_off_and_on():
-    arm = Arm().start()
-    assert [arm.told(arm.switch(on)) for on in (False, False, True, True)] == [""] * 4
-    assert arm.rig.torque() == [True] * 3
-
-
-def test_requests_that_follow_each_other_at_once_end_in_the_last_one():
-    arm = Arm().start()
-    for orders in ([False, True], [False, True, False], [False, True, False, True]):
-        numbers = [arm.switch(on) for on in orders]
-        arm.follow(30)
-        assert all(len(arm.answers[number]) == 1 for number in numbers)
-        assert arm.answers[numbers[-1]] == [""]
-        assert arm.rig.torque() == [True, orders[-1], True]
-
-
-@pytest.mark.parametrize("returning", [False, True])
-def test_a_joint_that_was_let_go_stays_limp_when_it_reboots(returning):
-    arm = Arm(returning=returning).let_go()
-    given = arm.rig.torque_given(12)
-    arm.servo.reboot()
-    arm.follow(150)
-    assert not any(given)
-    assert arm.shown[1] is Torque.RELEASED
-    assert arm.rig.states.valid.all()
-
-
 def test_a_joint_that_was_let_go_stays_limp_when_its_mode_changes_or_the_line_is_pulled():
     arm = Arm(returning=True).let_go()
     given = arm.rig.torque_given(12)
@@ -250,25 +223,6 @@ def _shut_down(arm):
     arm.follow(10)
 
 
-def test_torque_on_a_servo_with_a_hardware_error_is_refused_and_a_reboot_clears_it():
-    arm = Arm().start()
-    _shut_down(arm)
-    assert arm.shown[1] is Torque.OFF
-    problem = arm.told(arm.switch(True))
-    assert "arm_12_joint (ID 12 on bus arm) reports in Hardware Error Status (70)" in problem
-    assert "then reboot it" in problem
-    assert arm.rig.torque() == [True, False, True]
-    assert arm.told(arm.reboot()) == ""
-    arm.follow(2)
-    assert arm.rig.states.hardware_error[1] == 0
-    assert arm.rig.torque() == [True, False, True]  # it had none before
-    assert arm.told(arm.switch(True)) == ""
-    assert arm.rig.torque() == [True] * 3
-    _shut_down(arm)  # the same error again
-    assert arm.shown[1] is Torque.OFF
-    assert arm.rig.states.hardware_error[1] == 0x20
-
-
 def test_torque_on_a_servo_of_protocol_1_that_shut_down_says_what_helps():
     arm = Arm(1.0).start()
     _shut_down(arm)
@@ -298,23 +252,6 @@ def test_a_servo_that_held_holds_again_after_its_reboot(watchdog):
     assert not arm.rig.events.of(EventCode.SERVO_LOST)
 
 
-def test_reboots_by_request_do_not_exhaust_the_policy():
-    arm = Arm(returning=True).start()
-    for _ in range(3):
-        assert arm.told(arm.reboot()) == ""
-    arm.servo.reboot()
-    arm.follow(150)
-    assert arm.rig.torque() == [True] * 3
-
-
-def test_a_servo_that_was_let_go_is_limp_after_its_reboot():
-    arm = Arm(returning=True).let_go()
-    assert arm.told(arm.reboot()) == ""
-    arm.follow(5)
-    assert arm.shown[1] is Torque.RELEASED
-    assert arm.rig.torque() == [True, False, True]
-
-
 def without_torque(arm):
     """Let a servo lose its torque for a while, so that it is limp by no request."""
     arm.servo.poke("torque_enable", 0)
@@ -324,14 +261,6 @@ def without_torque(arm):
     arm.servo.silence(False)
     arm.follow(20)
     assert arm.state is ServoState.LIMP
-
-
-def test_a_servo_that_was_limp_by_no_request_is_limp_after_its_reboot():
-    arm = Arm(returning=True).start()
-    without_torque(arm)
-    assert arm.told(arm.reboot()) == ""
-    arm.follow(5)
-    assert arm.rig.torque() == [True, False, True]
 
 
 def test_a_limp_servo_that_is_lost_twice_gets_no_torque_when_it_is_back():
@@ -344,61 +273,6 @@ def test_a_limp_servo_that_is_lost_twice_gets_no_torque_when_it_is_back():
     arm.rig.hardware._look = True  # the cycles in between need not look at a servo at rest
     arm.follow(120)
     assert arm.state is ServoState.LIMP
-    assert arm.rig.torque() == [True, False, True]
-
-
-def test_a_servo_that_does_not_come_back_is_named_after_three_seconds():
-    arm = Arm().start()
-    number = arm.reboot()
-    arm.follow(2)
-    arm.servo.silence()
-    problem = arm.told(number)
-    assert problem.startswith("arm_12_joint (ID 12 on bus arm) did not answer within 3 s after its reboot")
-    arm.servo.silence(False)
-    arm.follow(120)
-    assert arm.rig.states.valid.all()
-    assert arm.rig.torque() == [True, False, True]  # by the policy for returned servos, which is limp
-
-
-@pytest.mark.parametrize("what", ["on", "reboot"])
-def test_a_servo_that_is_lost_is_named(what):
-    arm = Arm().start()
-    arm.servo.silence()
-    arm.rig.cycles(30)
-    assert arm.shown[1] is Torque.LOST
-    number = arm.switch(True) if what == "on" else arm.reboot()
-    assert arm.told(number) == "arm_12_joint (ID 12 on bus arm) does not answer"
-
-
-def test_a_servo_that_is_lost_is_limp_when_it_is_back_after_torque_off():
-    arm = Arm(returning=True).start()
-    arm.servo.silence()
-    arm.rig.cycles(30)
-    assert arm.told(arm.switch(False)).endswith(
-        "does not answer; dxlrun switches its torque off when it is back"
-    )
-    arm.servo.silence(False)
-    arm.follow(120)
-    assert arm.rig.torque() == [True, False, True]
-    assert arm.shown[1] is Torque.RELEASED
-
-
-def test_a_lost_servo_without_torque_stays_limp_after_torque_off_though_it_reboots():
-    arm = Arm(returning=True).start()
-    arm.servo.trigger_overload()
-    arm.follow(10)
-    assert arm.shown[1] is Torque.OFF
-    arm.servo.silence()
-    arm.rig.cycles(30)
-    assert arm.told(arm.switch(False)).endswith(
-        "does not answer; dxlrun switches its torque off when it is back"
-    )
-    begun = len(arm.rig.into_bus())
-    arm.servo.reboot()
-    arm.servo.silence(False)
-    arm.follow(200)
-    assert arm.shown[1] is Torque.RELEASED
-    assert (12, 1) not in arm.torque_bytes(begun)
     assert arm.rig.torque() == [True, False, True]
 
 
@@ -422,18 +296,6 @@ def test_requests_on_a_line_that_is_gone_are_answered():
     arm.rig.buses[0].plug_in()
     arm.follow(200)
     assert not arm.rig.torque()[1]
-
-
-def test_a_servo_out_of_its_limits_gets_no_torque():
-    arm = Arm().let_go()
-    plan = arm.plan.servos[1]
-    turn_by_hand(arm.servo, (plan.upper_tick + 40) * plan.rad_per_tick)
-    arm.follow(10)
-    problem = arm.told(arm.switch(True))
-    assert "outside its limits" in problem
-    assert arm.rig.torque() == [True, False, True]
-    arm.follow(1)
-    assert arm.shown[1] is Torque.RELEASED
 
 
 def test_a_servo_that_reboots_while_it_is_checked_gets_no_torque():
