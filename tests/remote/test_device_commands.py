@@ -59,31 +59,6 @@ def test_a_devices_commands_go_to_the_controller_that_has_them(board):
     assert json.loads(taken.request) == {"values": {"board/led": 1}}
 
 
-@pytest.mark.parametrize(
-    ("device", "values", "said"),
-    [
-        ("board", {"led": 2}, "led of board: 2 is outside 0 to 1"),
-        ("board", {"led": -0.5}, "led of board: -0.5 is outside 0 to 1"),
-        ("board", {"led": True}, "board/led = True is not a number"),
-        ("board", {"led": "on"}, "board/led = on is not a number"),
-        ("board", {"lde": 1}, "board has no command lde; did you mean led?"),
-        (
-            "board",
-            {},
-            "the request names no command of board (ID 102 on bus main); "
-            "name one of led, register_7, register_8",
-        ),
-        ("foot", {"led": 1}, "foot (ID 101 on bus main) has no commands"),
-        ("board", {"register_8": 1}, "commanded by no controller; `dxlrun switch --activate away`"),
-        ("bord", {"led": 1}, "there is no controller bord; did you mean board?"),
-    ],
-)
-def test_what_a_device_cannot_be_sent_does_not_reach_the_loop(board, device, values, said):
-    status, content = send(board, device, **values)
-    assert (status in {404, 422}, said in content["refused"]) == (True, True), content
-    assert board.taken == []
-
-
 def test_a_command_that_no_controller_takes_names_the_type_that_would(board, monkeypatch):
     loaded = board.link.controllers
     monkeypatch.delitem(loaded, "away")

@@ -74,72 +74,19 @@ def test_what_the_loop_refuses_is_refused_with_its_code(desk):
 
 
 LOAD = {"name": "more", "type": "arm", "joints": ["pan"]}
-WRONG = [
-    ("GET", "/nothing", None, 404, "unknown_page", "GET /nothing is not a request"),
-    ("POST", "/robot", None, 405, "wrong_method", "/robot does not support POST"),
-    ("GET", "/robot/", None, 404, "unknown_page", "not a request"),
-    ("POST", "/controllers/lefty/commands/go", {}, 404, "unknown_controller", "did you mean left?"),
-    ("POST", "/controllers/left/commands/goo", {}, 404, "unknown_command", "did you mean go?"),
-    ("POST", "/controllers/%2e%2e/commands/go", {}, 404, "unknown_controller", "known: left, right, spare"),
-    ("POST", GO, b"", 422, "invalid", "go of left is not JSON"),
-    ("POST", GO, b"[" * 100_000, 422, "invalid", "go of left is not JSON (recursion limit"),
-    ("POST", GO, b'{"positions": [NaN]}', 422, "invalid", "must be a finite number"),
-    ("POST", GO, b'{"positions": [1e999]}', 422, "invalid", "must be a finite number"),
-    ("POST", GO, {"positions": [True]}, 422, "invalid", "positions"),
-    ("POST", GO, {"positions": ["0.5"]}, 422, "invalid", "positions"),
-    ("POST", GO, {"positions": [2]}, 422, "beyond_limits", "go of left: pan is sent to 114.592 deg, outside its limits -57.3"),
-    ("POST", GO, {"positions": [-1e300]}, 422, "beyond_limits", "pan is sent to -5.72958e+301 deg, outside its limits"),
-    ("POST", SET_POINT, {"positions": [True]}, 422, "invalid", "positions"),
-    ("POST", GO, {"positions": [0], "speed": 1}, 422, "invalid", "go of left has an unknown key 'speed'"),
-    ("POST", GO, {"positions": [1, 2]}, 422, "invalid", "go of left: 1 positions, please"),
-    ("POST", GO, {"positions": ["x"] * 50_000}, 422, "invalid", "; and 49995 more"),
-    ("POST", "/controllers/left/commands/break", {"count": 1}, 422, "invalid", "KeyError: 'a mistake of its author'"),
-    ("POST", "/controllers/left/commands/leave", {"count": 1}, 422, "invalid", "SystemExit: 3"),
-    ("POST", "/controllers/left/commands/many", {"count": 40_000}, 413, "too_long", "the request has 320000 bytes"),
-    ("POST", "/controllers/left/set-points/many", {"count": 600}, 413, "too_long", "send the values as a command"),
-    ("POST", "/controllers/spare/set-points/go", {"positions": [0]}, 409, "not_active", "not active; switch to it first"),
-    ("POST", SET_POINT + "?lease=0", {"positions": [0]}, 422, "invalid", "a lease of 0 s is out of range; write 0.01 to 60 s"),
-    ("POST", SET_POINT + "?lease=61", {"positions": [0]}, 422, "invalid", "a lease of 61 s is out of range; write 0.01 to 60 s"),
-    ("POST", SET_POINT + "?lease=inf", {"positions": [0]}, 422, "invalid", "lease=inf is not a number"),
-    ("POST", SET_POINT + "?lease=long", {"positions": [0]}, 422, "invalid", "lease=long is not a number"),
-    ("GET", "/events?after=x", None, 422, "invalid", "after=x is not a number"),
-    ("POST", "/switch", b"{", 422, "invalid", 'write for example {"activate": ["head"]'),
-    ("POST", "/switch", b"[" * 100_000, 422, "invalid", "write for example"),
-    ("POST", "/switch", {"activate": ["nun"]}, 404, "unknown_controller", "there is no controller nun"),
-    ("POST", "/switch", {"activate": "left"}, 422, "invalid", "Expected `array`"),
-    ("POST", "/switch", {"start": ["left"]}, 422, "invalid", "unknown field `start`"),
-    ("POST", "/rate", {"rate": "fast"}, 422, "invalid", "Expected `float`"),
-    ("POST", "/rate", {"rate": True}, 422, "invalid", "Expected `float`"),
-    ("POST", "/rate", b'{"rate": 1' + b"0" * 400 + b"}", 422, "invalid", "write for example"),
-    ("POST", "/rate", {}, 422, "invalid", "missing required field `rate`"),
-    ("DELETE", "/controllers/lefty", None, 404, "unknown_controller", "did you mean left?"),
-    ("POST", "/controllers", LOAD | {"name": "../x"}, 422, "invalid", "is not a valid name"),
-    ("POST", "/controllers", LOAD | {"name": 5}, 422, "invalid", "must be text"),
-    ("POST", "/controllers", LOAD | {"name": "a" * 65}, 422, "invalid", "at most 64"),
-    ("POST", "/controllers", LOAD | {"name": "left"}, 409, "name_taken", "the run already has a controller left"),
-    ("POST", "/controllers", LOAD | {"type": "leg"}, 422, "invalid", "no plug-in offers the controller type leg"),
-    ("POST", "/controllers", LOAD | {"joints": ["pam"]}, 422, "invalid", "joint pam of more is not defined; did you mean pan?"),
-    ("POST", "/controllers", LOAD | {"joints": ["pan", "pan"]}, 422, "invalid", "more names joint pan twice; name it once"),
-    ("POST", "/controllers", LOAD | {"joints": 3}, 422, "invalid", "more.joints is 3"),
-    ("POST", "/controllers", LOAD | {"rate": "x"}, 422, "invalid", "is not a rate"),
-    ("POST", "/controllers", LOAD | {"active": True}, 422, "invalid", "load more first, then switch to it"),
-    ("POST", "/controllers", LOAD | {"fallback": "nun"}, 422, "invalid", "the fallback nun of more is not a controller"),
-    ("POST", "/controllers", LOAD | {"fallback": "more"}, 422, "invalid", "more is its own fallback; name another"),
-    ("POST", "/controllers", LOAD | {"into": "lefty"}, 422, "invalid", "`into` of more names an unknown controller lefty; did you mean left?"),
-    ("POST", "/controllers", LOAD | {"into": ["left", "more"]}, 422, "invalid", "left, but left exports no reference; remove `into`; no controller of the robot"),
-    ("POST", "/controllers", LOAD | {"into": ["left", "more"]}, 422, "invalid", "`into` of more names more itself"),
-    ("POST", "/controllers", LOAD | {"into": 3}, 422, "invalid", "is not the name of a controller"),
-    ("POST", "/controllers", b"[]", 422, "invalid", "Expected `object`"),
-]  # fmt: skip
+HUGE = [
+    (GO, b"[" * 100_000, "go of left is not JSON (recursion limit"),
+    (GO, json.dumps({"positions": ["x"] * 50_000}).encode(), "; and 49995 more"),
+    ("/switch", b"[" * 100_000, "write for example"),
+    ("/rate", b'{"rate": 1' + b"0" * 400 + b"}", "write for example"),
+    ("/controllers", json.dumps(LOAD | {"name": "a" * 65}).encode(), "at most 64"),
+]
 
 
-@pytest.mark.parametrize("wrong", WRONG, ids=[" ".join(wrong[:2]) for wrong in WRONG])
-def test_a_wrong_request_is_refused_with_one_sentence_and_never_reaches_the_loop(desk, wrong):
-    method, path, body, status, code, sentence = wrong
-    told, content = desk.ask(method, path, b"" if body is None else body)
-    assert told == status
-    assert (content["code"], sentence in content["refused"]) == (code, True), content
-    assert "\n" not in content["refused"]
+@pytest.mark.parametrize(("path", "body", "sentence"), HUGE, ids=range(len(HUGE)))
+def test_a_huge_request_is_refused_with_one_short_sentence(desk, path, body, sentence):
+    status, content = desk.ask("POST", path, body)
+    assert (status, content["code"], sentence in content["refused"]) == (422, "invalid", True), content
     assert len(content["refused"]) < 2001
     assert desk.taken == []
 
@@ -628,7 +575,7 @@ def test_the_page_gives_the_limits_that_are_kept():
 # Hostile bodies
 
 DEEP = b'{"positions":' + b'{"a":' * 900 + b"1" + b"}" * 901
-HUGE = b"9" * 400
+NINES = b"9" * 400
 
 
 @pytest.mark.parametrize("query", ["", "?units=true"])
@@ -638,10 +585,10 @@ HUGE = b"9" * 400
     [
         DEEP,
         b'{"pan":' + b"[" * 500 + b"]" * 500 + b"}",
-        b'{"pan":' + HUGE + b"}",
-        b'{"pan":-' + HUGE + b"}",
+        b'{"pan":' + NINES + b"}",
+        b'{"pan":-' + NINES + b"}",
         b'{"pan":1e400}',
-        b'{"positions":[' + HUGE + b"]}",
+        b'{"positions":[' + NINES + b"]}",
         b'{"positions":[1e400]}',
     ],
 )

@@ -150,24 +150,6 @@ def test_as_many_results_are_kept_as_there_is_room_for(arm):
     assert arm.ask("GET", f"/goals/{KEPT_GOALS + 50}")[1]["progress"] == 1.0
 
 
-@pytest.mark.parametrize(
-    ("path", "status", "code"),
-    [
-        ("/goals/9", 404, "unknown_goal"),
-        ("/goals/0", 404, "unknown_goal"),
-        ("/goals/-1", 422, "invalid"),
-        ("/goals/one", 422, "invalid"),
-        ("/goals/1?wait=-1", 422, "invalid"),
-        ("/goals/1?wait=60", 422, "invalid"),
-        ("/goals/1?wait=nan", 422, "invalid"),
-    ],
-)
-def test_a_goal_that_there_is_not_is_refused(arm, path, status, code):
-    report(arm, 1, "accepted")
-    assert arm.ask("GET", path)[0] == status
-    assert arm.ask("GET", path)[1]["code"] == code
-
-
 def test_a_client_waits_for_the_end_of_a_goal(arm):
     report(arm, 1, "accepted")
 

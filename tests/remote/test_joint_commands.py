@@ -121,63 +121,6 @@ def test_a_trajectory_gets_there_in_its_time(head):
     assert (status, taken.kind) == (200, "trajectory"), answer
 
 
-WRONG = [
-    ("positions", "position", {"pam": "0 deg"}, "", 404, "there is no joint pam; did you mean pan?"),
-    (
-        "positions",
-        "position",
-        {},
-        "",
-        422,
-        "position of positions names no joint; write for example pan=20deg",
-    ),
-    ("positions", "position", {"pan": 0.5}, "", 422, "pan: 0.5 has no unit"),
-    ("positions", "position", {"pan": "soon"}, "", 422, "pan: 'soon' is not an angle"),
-    ("positions", "velocity", {"pan": "1 rad/s"}, "", 404, "positions accepts position for each joint"),
-    ("whole", "velocity", {"pan": "1 rad/s"}, "", 404, "whole accepts position for each joint"),
-    ("whole", "positions", {"positions": ["0 deg", "0 deg"]}, "", 404, "whole has no command positions"),
-    ("positions", "position", {"pan": "80 deg"}, "", 422, "pan is sent to 80 deg, outside its limits"),
-    (
-        "posvel",
-        "velocity",
-        {"tilt": "1 rad/s"},
-        "",
-        422,
-        "tilt is commanded to 1 rad/s, more than 0.25 rad/s",
-    ),
-    ("positions", "position", {"pan": "0 deg"}, "&in=2", 422, "positions moves its joints immediately"),
-    ("whole", "position", {"pan": "0 deg"}, "&in=0", 422, "in=0 is out of range"),
-    (
-        "positions",
-        "positions",
-        {"positions": ["0 deg", "0 deg"]},
-        "&in=2",
-        422,
-        "contains its own times; omit in=",
-    ),
-    ("positions", "positions", {"positions": ["0 deg"]}, "", 422, "1 positions for 2 joints"),
-    ("positions", "posvel", {"pan": "0 deg"}, "", 404, "positions has no command posvel"),
-    (
-        "trajectory",
-        "position",
-        {"tilt": "80 deg"},
-        "&in=9",
-        422,
-        "tilt is sent to 80 deg in point 1, outside",
-    ),
-    ("pwm", "pwm", {"pan": 1.5}, "", 422, "pwm"),
-    ("pwm", "pwm", {"pan": True}, "", 422, "pan is 'True', but must be a finite number"),
-]
-
-
-@pytest.mark.parametrize("wrong", WRONG, ids=[f"{one[0]} {one[1]} {one[2]}" for one in WRONG])
-def test_what_does_not_fit_is_refused_with_one_sentence(head, wrong):
-    controller, interface, values, query, status, sentence = wrong
-    found, answer, taken = send(head, controller, interface, values, f"?units=true{query}")
-    assert (found, sentence in answer["refused"]) == (status, True), answer
-    assert taken is None
-
-
 # Goals
 
 

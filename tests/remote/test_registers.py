@@ -57,30 +57,6 @@ def test_a_servos_failure_is_the_answer(arm):
     assert (status, content["refused"], content["code"]) == (409, said, "register_not_written")
 
 
-@pytest.mark.parametrize(
-    ("path", "body", "status", "said"),
-    [
-        ("/joints/pen/registers/led", {"value": 1}, 404, "there is no joint pen; did you mean pan?"),
-        ("/joints/pan/registers/lad", {"value": 1}, 404, "pan: XM430-W350 has no register lad; did you mean led?"),
-        (GAIN, {"value": 20_000}, 422, "pan: Position P Gain (84) of an XM430-W350 is 0..16383, not 20000"),
-        (GAIN, {"value": "5 V"}, 422, "pan: Position P Gain (84) is a whole number without a unit, not '5 V'"),
-        ("/joints/pan/registers/profile_acceleration", {"value": "5 V"}, 422, "profile_acceleration of pan: '5 V' has the wrong unit V"),
-        ("/joints/pan/registers/goal_position", {"value": 1}, 422, "cannot be changed: controllers command it; write another item"),
-        ("/joints/pan/registers/present_position", {"value": 1}, 422, "can only be read; write another item"),
-        ("/joints/pan/registers/torque_enable", {"value": 0}, 422, "dxlrun switches the torque"),
-        ("/joints/pan/registers/bus_watchdog", {"value": 0}, 422, "dxlrun arms it"),
-        ("/joints/pan/registers/return_delay_time", {"value": 0}, 422, "is in the EEPROM"),
-        (GAIN, {"value": True}, 422, "Expected `int | str`, got `bool`"),
-        (GAIN, {"value": 1.0}, 422, "Expected `int | str`, got `float`"),
-        (GAIN, {"gain": 1}, 422, 'write for example {"value": 800}'),
-    ],
-)  # fmt: skip
-def test_what_cannot_be_written_does_not_reach_the_loop(arm, path, body, status, said):
-    found, content = arm.ask("POST", path, body)
-    assert (found, said in content["refused"]) == (status, True), content
-    assert arm.taken == []
-
-
 def test_an_item_is_read_with_its_meaning(arm):
     status, content = arm.ask(
         "GET", "/joints/pan/registers/return_delay_time", refusal=Completion(7, value=250)
@@ -132,52 +108,6 @@ def test_joints_and_groups_are_named(arm, kind, names, joints):
     assert (status, content["joints"]) == (200, joints)
     (taken,) = arm.taken
     assert (taken.kind, json.loads(taken.data)) == (kind, {"joints": joints, **data, "release": False})
-
-
-@pytest.mark.parametrize(
-    ("path", "body", "status", "said"),
-    [
-        ("/torque", {"joints": ["pen"], "on": True}, 404, "there is no joint pen; did you mean pan?"),
-        ("/torque", {"joints": [], "on": True}, 404, "name joints, groups, controllers, or all"),
-        ("/torque", {"joints": ["pan"]}, 422, "missing required field `on`"),
-        ("/torque", {"joints": "pan", "on": True}, 422, "Expected `array`, got `str`"),
-        ("/reboot", {"joints": ["pan"], "on": True}, 422, "unknown field `on`"),
-    ],
-)
-def test_what_cannot_be_switched_does_not_reach_the_loop(arm, path, body, status, said):
-    found, content = arm.ask("POST", path, body)
-    assert (found, said in content["refused"]) == (status, True), content
-    assert arm.taken == []
-
-
-@pytest.mark.parametrize(
-    ("path", "said"),
-    [
-        ("/joints/pen", "there is no joint pen; did you mean pan?"),
-        ("/joints/pen/registers/led", "there is no joint pen; did you mean pan?"),
-        ("/joints/pan/registers/lad", "pan: an XM430-W350 has no register lad; did you mean led?"),
-        ("/joints/pan/registers/nonsense", "list the registers by `dxlrun models XM430-W350`"),
-    ],
-)
-def test_what_there_is_not_cannot_be_read(arm, path, said):
-    found, content = arm.ask("GET", path)
-    assert (found, said in content["refused"]) == (404, True), content
-    assert arm.taken == []
-
-
-def test_a_servo_of_protocol_1_is_not_rebooted(desk):
-    table = find_table("AX-12A", 1.0)
-    bus = bus_plan(
-        name="main", port="sim", baud_rate=1_000_000, latency_ns=0, return_delay_ns=0,
-        joints=[Wiring("pan", 0, 3, table, 2.6, 1, -1.0, 1.0)], protocol=1.0,
-    )  # fmt: skip
-    desk.link.plan = replace(desk.link.plan, buses=(bus,))
-    status, content = desk.ask("POST", "/reboot", {"joints": ["pan"]})
-    assert (status, content["code"]) == (409, "not_rebooted")
-    assert content["refused"] == (
-        "pan (ID 3 on bus main) has no reboot instruction; switch the torque or the power off and on"
-    )
-    assert desk.taken == []
 
 
 def test_waiting_answers_keep_the_client_waiting(arm):

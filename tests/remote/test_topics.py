@@ -15,7 +15,6 @@ from dxlrun.messages.cdr import Codec
 from dxlrun.messages.declared import declared_message
 from dxlrun.messages.definition import MessageType
 from dxlrun.remote.live.live_topics import MOST_RECORDS
-from dxlrun.remote.preparation import RefusedRequest
 from dxlrun.remote.requests.replies import StreamMessage, StreamTopic
 
 
@@ -161,18 +160,6 @@ def test_cycles_that_are_missing_show_in_the_numbers_though_their_own_numbers_sk
     found = numbers(desk, stream)
     assert found[0] > 3
     assert found == list(range(found[0], 43))
-
-
-def test_an_unknown_topic_is_refused_with_those_that_exist(desk, number):
-    with pytest.raises(RefusedRequest) as refused:
-        desk.link.open_stream(["/joint_states", "/left/states"], newest=False)
-    assert str(refused.value) == (
-        "there is no topic /left/states; there are /left/state, /events, /cycle, /joint_states"
-    )
-    status, found = desk.ask("GET", "/stream?topic=/left/states")
-    assert (status, found["code"]) == (404, "unknown_topic")
-    assert desk.ask("GET", "/stream")[0] == 422
-    assert desk.ask("GET", "/stream?topic=/events&rate=-1")[0] == 422
 
 
 def test_the_numbers_go_on_when_a_controller_is_loaded_again(desk, number):
