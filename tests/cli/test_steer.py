@@ -12,6 +12,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from tests.kit.answers import read_answer, result_of
@@ -165,23 +166,64 @@ def test_a_robot_that_has_ended_is_an_error(
 # Steering
 
 
+def cases() -> Iterator[Any]:
+    """Yield the stories of `steered.txt`: lines of words, each with the lines that are printed."""
+    for block in (Path(__file__).parent / "steered.txt").read_text("utf-8").strip().split("\n\n"):
+        title, *lines = block.split("\n")
+        typed: list[tuple[str, list[str]]] = []
+        for line in lines:
+            if line.startswith("  "):
+                typed[-1][1].append(line.strip())
+            else:
+                typed.append((line, []))
+        yield pytest.param(typed, id=title)
+
+
+@pytest.mark.parametrize("typed", [*cases()])
+def test_what_is_typed_is_answered(dxlrun, torso: RemoteRobot, typed: list[tuple[str, list[str]]]) -> None:
+    """A line that begins with an exit code is an error; `...` is any text, of whole lines at the end."""
+    assert typed
+    for words, lines in typed:
+        said = dxlrun(*shlex.split(words))
+        code = int(lines[0][0]) if lines[0][0] in "12" else 0
+        wanted = "dxlrun: " + lines[0][2:] if code else "\n".join(lines)
+        pattern = ".*".join(re.escape(part) for part in wanted.split("..."))
+        shown = (said.err if code else said.out).rstrip("\n")
+        assert (said.code, bool(said.err)) == (code, code > 0), (words, said)
+        assert re.fullmatch(pattern, shown, re.DOTALL), (words, shown, wanted)
+
+
+def test_commands_leave_joints_and_registers_as_they_say(dxlrun, torso: RemoteRobot) -> None:
+    last = torso.events()["last"]
+    assert dxlrun("set", "head_yaw_joint", "ccw_compliance_slope", "128", "--debug").code == 0
+    printed = [event["text"] for event in torso.events(last)["events"] if event["name"] == "register_written"]
+    assert printed[-1].startswith("CCW Compliance Slope (29) was changed from ")
+    found = result_of(dxlrun("get", "head_yaw_joint", "return_delay_time", "--json").out)
+    assert (found["title"], found["area"]) == ("Return Delay Time (5)", "EEPROM")
+    assert torso.set_parameters("left_arm", {"speed": 2}) == {"speed": (1.0, 2.0)}
+    assert torso.parameters("left_arm")["speed"] == 2.0
+    torso.set_parameters("left_arm", {"speed": 1})
+    assert dxlrun("torque", "off", "head_yaw_joint", "--release").code == 0
+    assert [torso.get(joint)["torque"] for joint in ("head_yaw_joint", "head_pitch_joint")] == ["limp", "on"]
+    assert re.search(r"torque +limp", dxlrun("get", "head_yaw_joint").out)
+    assert not controllers(torso)["head"]["active"]
+    assert torso.torque("head", on=True).offered == ("head",)
+    said = dxlrun("torque", "off", "left_arm", "--release", "--json")
+    assert result_of(said.out)["deactivated"] == ["left_arm"]
+    assert "left_arm" in torso.torque("left_arm", on=True).offered
+    printed = result_of(dxlrun("halt", "--json").out)
+    assert set(printed) == {"robot", "cycle", "seconds", "joint", "velocity"}
+    assert [name for name, one in controllers(torso).items() if one["active"]] == ["joint_state_broadcaster"]
+    assert torso.switch(["head"]).cycle > printed["cycle"]
+    assert dxlrun("rate", "80").code == 0
+    assert torso.info()["rate"] == 80
+
+
 def test_send_moves_the_joints_that_are_named_with_units(dxlrun, torso: RemoteRobot) -> None:
     said = dxlrun("send", "head", "posvel", "positions=[20 deg, -30 deg]", "velocities=[1 rad/s, 30 rpm]")
     assert said == (0, "bioloid_torso: head accepted posvel\n", "")
     until_sent(torso, "head_yaw_joint", -0.5236)
     until_sent(torso, "head_pitch_joint", 0.3491)
-
-
-def test_a_register_is_set_while_the_robot_runs(dxlrun, torso: RemoteRobot) -> None:
-    last = torso.events()["last"]
-    said = dxlrun("set", "head_yaw_joint", "ccw_compliance_slope", "64", "--debug")
-    assert said == (0, "bioloid_torso: ccw_compliance_slope of head_yaw_joint is 32 -> 64\n", "")
-    printed = [event["text"] for event in torso.events(last)["events"] if event["name"] == "register_written"]
-    assert printed == ["CCW Compliance Slope (29) was changed from 32 to 64"]
-    assert dxlrun("set", "head_yaw_joint", "ccw_compliance_slope", "64").code == 0
-    said = dxlrun("set", "head_yaw_joint", "temperature_limit", "70 degC")
-    assert said.code == 2
-    assert "Temperature Limit (11) is in the EEPROM, not writable while the servo has torque" in said.err
 
 
 def test_a_goal_is_waited_for_and_reached(dxlrun, torso: RemoteRobot) -> None:
@@ -227,14 +269,6 @@ def test_ctrl_c_at_a_terminal_that_waits_cancels_the_goal(torso: RemoteRobot, st
     assert torso.goal_state(goal.number).status == "cancelled"
 
 
-def test_live_parameters_change_on_a_robot_that_runs(dxlrun, torso: RemoteRobot) -> None:
-    assert dxlrun("parameters", "left_arm", "speed=0.5").out == "bioloid_torso: left_arm speed: 1 -> 0.5\n"
-    assert torso.parameters("left_arm")["speed"] == 0.5
-    assert torso.set_parameters("left_arm", {"speed": 1}) == {"speed": (0.5, 1.0)}
-    said = dxlrun("parameters", "left_arm", "speed=50")
-    assert (said.code, "must be at most 10" in said.err) == (2, True), said
-
-
 def test_a_motion_is_played_into_a_robot_that_runs(dxlrun, torso: RemoteRobot, tmp_path: Path) -> None:
     file = tmp_path / "nod.yaml"
     file.write_text(
@@ -254,55 +288,6 @@ def test_a_motion_is_played_into_a_robot_that_runs(dxlrun, torso: RemoteRobot, t
         2,
         [f"{file}:3:17: controller head is not active; activate it by `dxlrun switch --activate head`"],
     )
-
-
-def test_a_joint_is_limp_and_holds_again_while_the_robot_runs(dxlrun, torso: RemoteRobot) -> None:
-    commanded = "head_yaw_joint is commanded by head; deactivate head first, or add --release"
-    assert dxlrun("torque", "off", "head_yaw_joint") == (1, "", f"dxlrun: {commanded}\n")
-    limp = "bioloid_torso: head_yaw_joint is limp; deactivated head\n"
-    assert dxlrun("torque", "off", "head_yaw_joint", "--release") == (0, limp, "")
-    assert torso.get("head_yaw_joint")["torque"] == "limp"
-    assert torso.get("head_pitch_joint")["torque"] == "on"
-    assert not controllers(torso)["head"]["active"]
-    said = dxlrun("switch", "--activate", "head")
-    assert (said.code, said.out) == (1, "")
-    assert (
-        "head_yaw_joint (ID 21 on bus main) is limp; switch torque on with `dxlrun torque on head_yaw_joint`"
-        in said.err
-    )
-    said = dxlrun("get", "head_yaw_joint")
-    assert (said.code, said.err) == (0, "")
-    assert re.search(r"torque +limp", said.out)
-    assert dxlrun("torque", "off", "head_pitch_joint").out == "bioloid_torso: head_pitch_joint is limp\n"
-    said = dxlrun("torque", "on", "head_yaw_joint")  # head has another limp joint, and would be refused
-    assert said.out == "bioloid_torso: head_yaw_joint has torque\n"
-    again = "activate head again: `dxlrun switch --activate head`"
-    assert dxlrun("torque", "on", "head").out == f"bioloid_torso: head has torque; {again}\n"
-    assert torso.get("head_yaw_joint")["torque"] == "on"
-    torso.switch(["head"])
-    assert dxlrun("torque", "on", "head").out == "bioloid_torso: head has torque\n"
-    said = dxlrun("torque", "off", "left_arm", "--release", "--json")
-    assert result_of(said.out)["deactivated"] == ["left_arm"]
-    assert torso.torque("left_arm", on=True).offered == ("left_arm",)
-
-
-def test_items_are_read_and_what_cannot_be_is_said(dxlrun, torso: RemoteRobot) -> None:
-    said = dxlrun("get", "head_yaw_joint", "temperature_limit")
-    assert said == (0, "bioloid_torso: Temperature Limit (11) of head_yaw_joint is 70 (70 degC)\n", "")
-    found = result_of(dxlrun("get", "head_yaw_joint", "return_delay_time", "--json").out)
-    assert (found["title"], found["area"], found["value"]) == (
-        "Return Delay Time (5)",
-        "EEPROM",
-        found["value"],
-    )
-    assert dxlrun("get", "head_yaw_joint", "nonsense").code == 2
-    assert "did you mean head_yaw_joint?" in dxlrun("get", "head_yaw").err
-    said = dxlrun("reboot", "head_yaw_joint", "--release")
-    assert (said.code, said.out) == (1, "")
-    assert "has no reboot instruction" in said.err
-    assert dxlrun("torque", "off").code == 2
-    assert dxlrun("torque", "maybe", "head").code == 2
-    assert controllers(torso)["head"]["active"]
 
 
 def test_a_snapshot_of_the_robot(dxlrun, torso: RemoteRobot) -> None:
@@ -341,31 +326,6 @@ def test_a_command_is_one_request(dxlrun, torso: RemoteRobot, monkeypatch: pytes
     assert asked == ["POST /controllers/head/commands/posvel?units=true", "POST /switch"]
 
 
-@pytest.mark.parametrize(
-    ("words", "sentence"),
-    [
-        ("send heat posvel", "there is no controller heat; did you mean head?"),
-        ("send head possvel", "head has no command possvel; did you mean posvel?"),
-        ("send joint_state_broadcaster go", "joint_state_broadcaster has no command go; there is none"),
-        ("send head posvel positions=[30,0]", "positions[0]: 30 has no unit; write an angle with its unit"),
-        ("send head posvel positions=[30deg,0deg]", "posvel of head has no velocities; add"),
-        ("send head posvel positions=[1deg] force=.nan", "force is nan, but must be a finite number"),
-        ("send head posvel positions=[1deg] velocities=[1rpm]", "1 positions for 2 joints"),
-        (
-            "switch --activate hed --deactivate left_arn",
-            "there is no controller hed, left_arn; hed: did you mean head?; left_arn: did you mean left_arm?",
-        ),
-        ("unload spar", "there is no controller spar; known: "),
-        ("load spare type=joint_state_brodcaster", "did you mean joint_state_broadcaster?"),
-        ("pause --robot torso", "robot torso is not running; known: bioloid_torso"),
-    ],
-)
-def test_a_wrong_request_is_wrong_input(dxlrun, torso: RemoteRobot, words: str, sentence: str) -> None:
-    said = dxlrun(*words.split())
-    assert (said.code, said.out) == (2, "")
-    assert sentence in said.err
-
-
 def test_a_refusal_has_its_code_and_its_fields_for_programs(dxlrun, torso: RemoteRobot) -> None:
     said = dxlrun("switch", "--activate", "head", "--json")
     (error,) = read_answer(said.out).errors
@@ -379,81 +339,6 @@ def test_a_refusal_has_its_code_and_its_fields_for_programs(dxlrun, torso: Remot
     )
     (error,) = read_answer(said.out).errors
     assert (said.code, error.code, error.fields["joints"]) == (2, "beyond_limits", ["head_pitch_joint"])
-
-
-@pytest.mark.parametrize(
-    ("words", "sentence"),
-    [
-        (
-            "switch --activate whole_body_position",
-            "controllers left_arm and whole_body_position both command joint",
-        ),
-        ("switch --activate head", "head is active already"),
-        ("resume", "the loop is not paused"),
-        ("load spare type=joint_state_broadcaster", "the loop is not paused"),
-        ("rate 100000", "Hz"),
-    ],
-)
-def test_what_the_loop_refuses_is_a_failure_with_its_reason(
-    dxlrun, torso: RemoteRobot, words: str, sentence: str
-) -> None:
-    said = dxlrun(*words.split())
-    assert (said.code, said.out) == (1, "")
-    assert said.err.startswith("dxlrun: ")
-    assert sentence in said.err
-
-
-def test_a_switch_hands_joints_over(dxlrun, torso: RemoteRobot) -> None:
-    words = "--activate whole_body_position --deactivate head left_arm right_arm"
-    said = dxlrun("switch", *words.split())
-    assert said.out == "bioloid_torso: whole_body_position activated; head, left_arm, right_arm deactivated\n"
-    active = [name for name, one in controllers(torso).items() if one["active"]]
-    assert active == ["joint_state_broadcaster", "whole_body_position"]
-
-
-def test_a_controller_that_is_switched_off_and_on_has_begun_anew(dxlrun, torso: RemoteRobot) -> None:
-    said = dxlrun("switch", "--activate", "head", "--deactivate", "head", "left_arm")
-    assert said.out == "bioloid_torso: left_arm deactivated; head restarted\n"
-
-
-def test_a_rate_holds_at_once(dxlrun, torso: RemoteRobot) -> None:
-    assert dxlrun("rate", "80").out == "bioloid_torso runs at 80 Hz\n"
-    assert torso.info()["rate"] == 80
-    assert dxlrun("list").out.startswith("bioloid_torso: 80 Hz, ")
-
-
-def test_a_halted_robot_holds_until_a_controller_is_activated(dxlrun, torso: RemoteRobot) -> None:
-    said = dxlrun("halt")
-    assert (said.code, said.err) == (0, "")
-    assert re.fullmatch(
-        r"bioloid_torso stands still after \d\.\d\d s \(\w+: [\d.e-]+ rad/s\); "
-        r"to continue, activate a controller: `dxlrun switch --activate NAME`\n",
-        said.out,
-    )
-    active = [name for name, one in controllers(torso).items() if one["active"]]
-    assert active == ["joint_state_broadcaster"]
-    printed = result_of(dxlrun("halt", "--json").out)
-    assert set(printed) == {"robot", "cycle", "seconds", "joint", "velocity"}
-    assert torso.switch(["head"]).cycle > printed["cycle"]
-
-
-def test_a_pause_is_when_controllers_are_loaded_and_unloaded(dxlrun, torso: RemoteRobot) -> None:
-    assert dxlrun("pause").out == (
-        "bioloid_torso is paused, its joints are held; continue by `dxlrun resume`\n"
-    )
-    assert dxlrun("list").out.startswith("bioloid_torso: 50 Hz, paused, ")
-    said = dxlrun("load", "spare", "type=joint_group_position_controller", "joints=[head_yaw_joint]")
-    assert said == (
-        0, "bioloid_torso: spare is loaded; start it by `dxlrun switch --activate spare`\n", "",
-    )  # fmt: skip
-    assert dxlrun("load", "spare", "type=joint_state_broadcaster").code == 1
-    assert dxlrun("switch", "--activate", "spare", "--deactivate", "head").code == 0
-    assert dxlrun("unload", "spare").err == "dxlrun: spare is active; deactivate it first\n"
-    assert dxlrun("switch", "--deactivate", "spare", "--activate", "head").code == 0
-    assert dxlrun("unload", "spare").out == "bioloid_torso: spare is unloaded\n"
-    assert dxlrun("resume").out == "bioloid_torso runs again\n"
-    assert torso.info()["paused"] is False
-    assert "spare" not in controllers(torso)
 
 
 def test_of_several_robots_one_must_be_chosen(dxlrun, torso: RemoteRobot, stage: Stage) -> None:
