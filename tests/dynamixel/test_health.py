@@ -3,7 +3,6 @@
 from functools import partial
 
 import pytest
-from msgspec.structs import replace
 from tests.kit.line_faults import truncate_next
 from tests.kit.rigs import goals_in, make_plan, make_x, start_rig
 
@@ -204,13 +203,3 @@ def test_stop_with_a_silent_servo_limps_those_behind_it_at_once():
     off_ns = next(e.t_ns for e in rig.ledger.entries if e.t_ns >= start and e.data == last)
     assert off_ns - start < 50_000_000
     assert rig.clock.now_ns() - start < 400_000_000
-
-
-def test_watchdogs_are_disarmed_at_the_end_and_a_start_alone_arms_them():
-    rig = start_rig(replace(make_x((11, 12)), watchdog_ticks=10))
-    rig.cycles(50)
-    assert rig.registers("bus_watchdog") == [10, 10]
-    assert rig.events.of(EventCode.WATCHDOG) == []
-    rig.hardware.stop()
-    rig.torque()
-    assert rig.registers("bus_watchdog") == [0, 0]

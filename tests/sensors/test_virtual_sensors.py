@@ -13,6 +13,7 @@ from dxlrun.channels.commands import CommandMessage
 from dxlrun.control.sampled_sources import SampledSource
 from dxlrun.errors import InputError, PlugInError, PortError
 from dxlrun.features.sensors.events import SensorEvent
+from dxlrun.features.sensors.plan import decode_sensors
 from dxlrun.log.log_reader import Log, read_log
 from dxlrun.run import virtual_run
 from dxlrun.run.virtual_run import VirtualRobot
@@ -29,6 +30,15 @@ def run(path: Path, log: Path, positions: tuple[float, float], seconds: float = 
     robot.inbox.waiting.append(CommandMessage(0, "arm", "position", np.array(positions).tobytes(), "test"))
     assert robot.run().detail == ""
     return read_log(log)
+
+
+@pytest.mark.parametrize(
+    ("entry", "period_ms", "timeout_ms"),
+    [("", 10, 50), (", rate: 1000", 1, 50), (", rate: 10", 100, 500), (", timeout: 20 ms", 10, 20)],
+)
+def test_rate_and_timeout_have_defaults_by_the_loop_and_by_the_rate(crane, entry, period_ms, timeout_ms):
+    (plan,) = decode_sensors(plan_of(crane(("link: tip}", f"link: tip{entry}}}"))).feature_plans["sensors"])
+    assert (plan.period_ns, plan.timeout_ns) == (period_ms * 1_000_000, timeout_ms * 1_000_000)
 
 
 def states(log: Log) -> dict[str, np.ndarray]:
