@@ -1,4 +1,4 @@
-"""Experiments: one that plays what it is given, on rigs of virtual time; and the commands of the pages."""
+"""Experiments: one that plays what it is given, and the commands of the pages."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ import numpy as np
 from tests.kit.pages import page_text
 
 from dxlrun.errors import Refused
-from dxlrun.testing import plan_of
 from dxlrun_lab.guided.choice import situation_of
 from dxlrun_lab.guided.experiment import (
     Abort,
@@ -23,7 +22,6 @@ from dxlrun_lab.guided.experiment import (
 )
 from dxlrun_lab.guided.rig import Rig
 from dxlrun_lab.guided.segment import Segment, SegmentRecording
-from dxlrun_lab.guided.virtual_rig import virtual_rig
 
 ROOT = Path(__file__).parents[2]
 ROBOTS = ROOT / "robots"
@@ -59,35 +57,20 @@ def sine(joint: ExperimentJoint, rate: float = 320, seconds: float = 1.0, **more
     return Segment("sine", 1 / rate, {joint.name: wave}, **more)
 
 
-class Stage:
-    """Rigs of one test, and experiments that are performed on them."""
+def state_of(rig: Rig) -> object:
+    """Return what an experiment must leave as it was."""
+    return rig.controllers(), rig.rate, rig.paused
 
-    Plays, sine = Plays, staticmethod(sine)
-    single, arm = ROBOTS / "single_joint.yaml", ROBOTS / "effort_arm.yaml"
 
-    def __init__(self, directory: Path) -> None:
-        self.directory = directory
-        self.rigs: list[Rig] = []
-
-    def rig(self, robot: Path, each_cycle: Callable[[int], None] = lambda cycle: None) -> Rig:
-        log = self.directory / f"{len(self.rigs)}.mcap"
-        self.rigs.append(virtual_rig(plan_of(robot), log=log, each_cycle=each_cycle))
-        return self.rigs[-1]
-
-    @staticmethod
-    def state(rig: Rig) -> object:
-        """Return what must be as it was before."""
-        return rig.controllers(), rig.rate, rig.paused
-
-    def perform(
-        self, rig: Rig, joint: str, segments: Segments, abort: Abort = lambda: None
-    ) -> tuple[Plays, ExperimentOutcome]:
-        """Perform, and check that the run is as it was before."""
-        before, plays = self.state(rig), Plays(segments)
-        done = perform_experiment(rig, plays, situation_of(rig, [joint], {}), abort)
-        assert done.not_restored == ()
-        assert self.state(rig) == before
-        return plays, done
+def perform(
+    rig: Rig, joint: str, segments: Segments, abort: Abort = lambda: None
+) -> tuple[Plays, ExperimentOutcome]:
+    """Perform an experiment, and check that the run is as it was before."""
+    before, plays = state_of(rig), Plays(segments)
+    done = perform_experiment(rig, plays, situation_of(rig, [joint], {}), abort)
+    assert done.not_restored == ()
+    assert state_of(rig) == before
+    return plays, done
 
 
 def commands_of(page: str, verb: str, section: str = "") -> list[list[str]]:

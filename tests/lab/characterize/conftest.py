@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +14,7 @@ from dxlrun_lab.guided.choice import situation_of
 from dxlrun_lab.guided.experiment import perform_experiment
 from dxlrun_lab.guided.rig import Rig
 
-REFERENCES = {"AX-12A": "150 deg"}
+PROTOCOLS = {"AX-12A": 1.0, "MX-64": 1.0, "XL430-W250": 2.0, "XM430-W350": 2.0}
 
 
 @dataclass
@@ -27,38 +27,22 @@ class Done:
         return found
 
 
-Measures = Callable[..., Done]
-
-
-def robot_text(  # the keys of a robot file, each with what most tests leave as it is
-    model: str = "MX-64",
-    *,
-    protocol: float = 1.0,
-    baud_rate: int = 1_000_000,
-    rate: float = 100,
-    simulation: str = "{}",
-    registers: str = "{}",
-    limits: str = "{}",
-    direction: int = 1,
-    more: str = "",
-) -> str:
-    bus = f"port: sim, protocol: {protocol}, baud_rate: {baud_rate}, adapter: {{latency: 0 ms}}"
-    joint = (
-        f"bus: main, id: 1, model: {model}, reference: {REFERENCES.get(model, '180 deg')}, "
-        f"direction: {direction}, simulation: {simulation}, registers: {registers}, limits: {limits}"
-    )
-    top = f"name: bench\nbuses: {{main: {{{bus}}}}}\nloop: {{rate: {rate}}}\n"
-    return f"{top}joints:\n  joint: {{{joint}}}\n{more}"
-
-
 @pytest.fixture
-def measures(stage):
-    """Characterize a joint, or perform another experiment."""
+def measures(own_rig, tmp_path):
+    """Characterize a joint, or perform another experiment; other keys are those of the joint."""
 
-    def measure(measurements, model="MX-64", *, reach=1.0, tolerance=TOLERANCE, each_cycle=None, **keys):
-        file = stage.directory / f"{len(stage.rigs)}.yaml"
-        file.write_text(robot_text(model, **keys))
-        rig = stage.rig(file)
+    def measure(measurements, model="MX-64", *, reach=1.0, tolerance=TOLERANCE, each_cycle=None,
+                baud_rate=1_000_000, rate=100, direction=1, more="", **keys):  # fmt: skip
+        reference = "150 deg" if model == "AX-12A" else "180 deg"
+        joint = f"bus: main, id: 1, model: {model}, reference: {reference}, direction: {direction}"
+        joint += "".join(f", {key}: {value}" for key, value in keys.items())
+        bus = f"port: sim, protocol: {PROTOCOLS[model]}, baud_rate: {baud_rate}, adapter: {{latency: 0 ms}}"
+        file = tmp_path / "bench.yaml"
+        file.write_text(
+            f"name: bench\nbuses: {{main: {{{bus}}}}}\nloop: {{rate: {rate}}}\n"
+            f"joints:\n  joint: {{{joint}}}\n{more}"
+        )
+        rig = own_rig(file)
         if each_cycle is not None:
             rig.robot.link.each_cycle = lambda cycle: each_cycle(rig, cycle)
         experiment = (

@@ -1,9 +1,8 @@
-"""What cannot be measured is said, with the reason, and not invented."""
+"""What cannot be measured is reported with the reason, and not invented."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from fractions import Fraction
 from typing import Any
 
@@ -18,11 +17,10 @@ from dxlrun_lab.characterize.trace import Trace
 pytestmark = pytest.mark.long
 
 TICK = math.radians(0.088)
-Measures = Callable[..., Any]
 
 
 def stepping(noise: float, *, lag_s: float = 0.03, delay_s: float = 0.02) -> list[response.StepResponse]:
-    """Return steps that begin with the square of the time behind a delay; `noise`, rad, of positions."""
+    """Return steps that begin with the square of the time after a delay; `noise`, rad, of positions."""
     random, found = np.random.default_rng(3), []
     for rate in (44, 47, 51, 53, 57, 61):
         time = np.arange(round(2.5 * rate)) / rate
@@ -43,14 +41,10 @@ def step_of(way: float, height: float) -> response.StepResponse:
     )
 
 
-def test_the_response_of_clean_steps_is_found_by_the_estimator_alone():
-    first, rise = response.response(stepping(0.0))
-    assert first.value == pytest.approx(0.020, abs=0.002)
-    assert rise.value == pytest.approx(0.020 + 0.03, rel=0.05)
-
-
-def test_noise_widens_the_interval_until_nothing_is_told():
+def test_noise_widens_the_interval_until_nothing_is_reported():
     quiet, noisy = (response.response(stepping(noise)) for noise in (0.0, 1.5 * TICK))
+    assert quiet[0].value == pytest.approx(0.020, abs=0.002)
+    assert quiet[1].value == pytest.approx(0.020 + 0.03, rel=0.05)
     assert noisy[1].uncertainty > quiet[1].uncertainty
     first, rise = response.response(stepping(0.05))
     assert (first.value, rise.value) == (None, None)
@@ -58,42 +52,38 @@ def test_noise_widens_the_interval_until_nothing_is_told():
 
 
 @pytest.mark.parametrize(
-    ("value", "uncertainty", "words"),
-    [
-        (0.002, 0.001, ("2 ms", "± 1")),
-        (0.001, 0.002, ("below 3 ms", "")),
-        (-0.001, 0.001, ("below 2 ms", "")),
-    ],
+    ("value", "uncertainty", "shown", "shown_uncertainty"),
+    [(0.002, 0.001, "2 ms", "± 1"), (0.001, 0.002, "below 3 ms", ""), (-0.001, 0.001, "below 2 ms", "")],
 )
-def test_a_figure_that_is_not_told_from_0_is_an_upper_bound(value, uncertainty, words):
+def test_a_figure_that_is_not_distinct_from_0_is_an_upper_bound(value, uncertainty, shown, shown_uncertainty):
     one = JointFigure("response", "s", value, uncertainty)
-    assert (
-        characterization_tables.format_figure(one),
-        characterization_tables.shown_uncertainty(one),
-    ) == words
+    assert characterization_tables.format_figure(one) == shown
+    assert characterization_tables.shown_uncertainty(one) == shown_uncertainty
 
 
 def test_estimators_refuse_nothing_and_motions_without_motion():
     assert response.response([])[0].why.startswith("only 0 steps started at rest")
     still = [step_of(0.0, 0.1)] * 8
     assert "the joint moved by only 0 deg in steps of 5.7 deg" in response.response(still)[0].why
-    for figure in speeds.speeds(still, 1.0, 5.0):
-        assert (figure.value, figure.why) == (None, "the joint hardly moved")
+    small = response.response([step_of(0.01, 0.01)] * 8)[0].why
+    assert "too small for positions in ticks of 0.088 deg; give a range of about 2 deg" in small
+    found = speeds.speeds(still, 1.0, 5.0)
+    assert {(figure.value, figure.why) for figure in found} == {(None, "the joint hardly moved")}
     assert dead_band.dead_band([], TICK, {}, TICK)[0].value is None
     assert gaps.longest_gap([], "position", 0.02, 0.004, 1.0).value is None
     kept = [gaps.GapResult(gap / 100, 0.001, False) for gap in range(1, 5)]
-    assert "stayed within 1.1 deg at the longest tried gap, 40 ms" in (
-        gaps.longest_gap(kept, "position", 0.02, 0.004, 1.0).why
-    )
+    why = gaps.longest_gap(kept, "position", 0.02, 0.004, 1.0).why
+    assert "stayed within 1.1 deg at the longest tried gap, 40 ms" in why
 
 
 def test_a_joint_that_does_not_follow_its_goal_has_no_dead_band():
     """Its goal moves within the dead band: the errors at its rests are those of the goal, and say nothing."""
     rows, _ = dead_band.table(dead_band.stops([-0.01, 0.0, 0.01], 0.05), 1 / 60)
     time = np.arange(len(rows)) / 60
-    followed = np.roll(rows, 2)
-    stuck = dead_band.approaches(Trace(time, np.zeros(len(rows)), time + 0.001, rows, TICK))
-    moved = dead_band.approaches(Trace(time, followed, time + 0.001, rows, TICK))
+    stuck, moved = (
+        dead_band.approaches(Trace(time, position, time + 0.001, rows, TICK))
+        for position in (np.zeros(len(rows)), np.roll(rows, 2))
+    )
     assert (len(stuck), len(moved)) == (0, 12)
     band, change = dead_band.dead_band(stuck, TICK, {}, TICK)
     assert (band.value, change.value) == (None, None)
@@ -107,15 +97,15 @@ def test_a_longest_gap_is_one_that_left_the_path_or_in_which_the_joint_rested():
     assert (rested.value, rested.limit) == (pytest.approx(0.015), "the joint stops between commands")
     left = gaps.longest_gap([kept, gaps.GapResult(0.02, 0.021, False)], "position", 0.0191, 0.004, 1.0)
     assert left.value == pytest.approx(0.01905)
-    assert left.value - left.uncertainty <= 0.01 + 1e-12, "all that lies between the gaps that were tried"
+    assert left.value - left.uncertainty <= 0.01 + 1e-12, "all between the gaps that were tried"
 
 
-def test_the_machines_lateness_does_not_count_against_a_rate():
-    late = rates.RateResult(500.0, 1000, lost=0, too_long=20, late=400, exchange_s=0.0008)
-    assert late.fault == ""
-    slow = rates.RateResult(500.0, 1000, lost=0, too_long=990, late=0, exchange_s=0.0021)
-    assert slow.fault == "bus"
-    assert rates.RateResult(500.0, 1000, lost=2, too_long=0, late=0, exchange_s=0.0008).fault == "servo"
+@pytest.mark.parametrize(
+    ("lost", "too_long", "late", "exchange_s", "fault"),
+    [(0, 20, 400, 0.0008, ""), (0, 990, 0, 0.0021, "bus"), (2, 0, 0, 0.0008, "servo")],
+)
+def test_the_machines_lateness_does_not_count_against_a_rate(lost, too_long, late, exchange_s, fault):
+    assert rates.RateResult(500.0, 1000, lost, too_long, late, exchange_s).fault == fault
 
 
 @pytest.mark.parametrize(
@@ -127,7 +117,7 @@ def test_the_machines_lateness_does_not_count_against_a_rate():
         (125.0, 0, 200.0, None),
     ],
 )
-def test_the_search_goes_on_to_the_next_rate_that_controllers_allow(begin, step, keeps, expected):
+def test_the_search_continues_with_the_next_rate_that_controllers_allow(begin, step, keeps, expected):
     """A controller of 50 Hz, as most robots have one, leaves multiples of it: less than GROWS allows."""
     judged = []
     while (rate := rates.following(judged, begin, 410.0, Fraction(step))) is not None:
@@ -139,15 +129,11 @@ def test_the_search_goes_on_to_the_next_rate_that_controllers_allow(begin, step,
         assert 0.98 * keeps < max(rate for rate in tried if rate <= keeps) <= keeps
 
 
-def test_a_step_of_few_ticks_names_a_range_that_would_do():
-    assert "too small for positions in ticks of 0.088 deg; give a range of about 2 deg" in (
-        response.response([step_of(0.01, 0.01)] * 8)[0].why
-    )
-
-
 def test_a_joint_that_is_stuck_has_no_figures(measures):
     done = measures(["response"], "MX-64", simulation="{friction: 5.5 Nm}")
-    for figure in done.result.joints[0].figures:
+    figures = done.result.joints[0].figures
+    assert figures
+    for figure in figures:
         assert figure.value is None, figure
         assert "the joint moved by only 0 deg" in figure.why
     assert done.result.why == ""

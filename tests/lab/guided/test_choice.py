@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -19,12 +18,11 @@ name: mixed
 buses:
   main: {port: sim, protocol: 2.0, baud_rate: 1_000_000, return_delay_time: 0 us}
 loop: {rate: 100}
+joint_defaults: {bus: main, model: XM430-W350, reference: 180 deg, direction: 1}
 joints:
-  narrow:
-    {bus: main, id: 1, model: XM430-W350, reference: 180 deg, direction: 1,
-     limits: {position: [-20 deg, 90 deg]}}
-  wheel: {bus: main, id: 2, model: XM430-W350, reference: 180 deg, direction: 1, continuous: true}
-  limp: {bus: main, id: 3, model: XM430-W350, reference: 180 deg, direction: 1, torque: off}
+  narrow: {id: 1, limits: {position: [-20 deg, 90 deg]}}
+  wheel: {id: 2, continuous: true}
+  limp: {id: 3, torque: off}
 controllers:
   hold: {type: joint_group_position_controller, joints: [narrow]}
 """
@@ -39,13 +37,6 @@ def rig(tmp_path_factory):
     rig.close()
 
 
-def refused(rig: Any, *names: str, **ranges: tuple[float, float]) -> list[str]:
-    in_rad = {name: (math.radians(low), math.radians(high)) for name, (low, high) in ranges.items()}
-    with pytest.raises(InputError) as caught:
-        situation_of(rig, names, in_rad)
-    return list(caught.value.sentences)
-
-
 def test_the_default_range_is_around_the_joint_and_within_its_limits(rig):
     (joint,) = situation_of(rig, ["narrow"], {}).joints
     assert math.degrees(joint.lower) == pytest.approx(-20, abs=0.1), "its limit is nearer than 30 deg"
@@ -55,40 +46,56 @@ def test_the_default_range_is_around_the_joint_and_within_its_limits(rig):
     assert joint.lower < low < joint.middle < high < joint.upper
 
 
-def test_a_range_is_taken_as_it_is_given(rig):
+def test_a_range_is_used_as_it_is_given(rig):
     ranges = parse_ranges(["narrow=-10deg..0.5 rad", "wheel=-720 deg..720deg"])
     joints = situation_of(rig, ["wheel", "narrow"], ranges).joints
-    assert [joint.name for joint in joints] == ["wheel", "narrow"], "in the order of the command line"
+    assert [joint.name for joint in joints] == ["wheel", "narrow"], "as on the command line"
     assert (joints[1].lower, joints[1].upper) == (math.radians(-10), 0.5)
     assert joints[0].upper == pytest.approx(4 * math.pi)
 
 
-def test_everything_that_is_wrong_with_ranges_is_refused_at_once(rig):
-    assert refused(rig, "narrow", "wheel", "limp", narrow=(-30, 20)) == [
-        "--range narrow=-30..20 deg is beyond the joint's limits of -20 to 90 deg; stay inside",
-        "joint wheel has no position limits; give --range, such as wheel=-30deg..30deg",
-    ]
-    assert refused(rig, "narrow", "limp", narrow=(10, 60)) == [
-        "joint narrow is at 0 deg, outside of its --range; move the joint inside first",
-        "joint limp (ID 3 on bus main) is limp; enable its torque first: dxlrun torque on limp",
-    ]
+@pytest.mark.parametrize(
+    ("names", "degrees", "sentences"),
+    [
+        (
+            ["narrow", "wheel", "limp"],
+            (-30, 20),
+            [
+                "--range narrow=-30..20 deg is beyond the joint's limits of -20 to 90 deg; stay inside",
+                "joint wheel has no position limits; give --range, such as wheel=-30deg..30deg",
+            ],
+        ),
+        (
+            ["narrow", "limp"],
+            (10, 60),
+            [
+                "joint narrow is at 0 deg, outside of its --range; move the joint inside first",
+                "joint limp (ID 3 on bus main) is limp; enable its torque first: dxlrun torque on limp",
+            ],
+        ),
+    ],
+)
+def test_everything_that_is_wrong_with_ranges_is_refused_at_once(rig, names, degrees, sentences):
+    with pytest.raises(InputError) as caught:
+        situation_of(rig, names, {"narrow": tuple(map(math.radians, degrees))})
+    assert list(caught.value.sentences) == sentences
 
 
 @pytest.mark.parametrize(
     ("word", "sentence"),
     [
-        ("elbow", "--range elbow: write JOINT=LOWEST..HIGHEST, such as elbow=-30deg..30deg"),
-        ("elbow=3deg", "--range elbow=3deg: write JOINT=LOWEST..HIGHEST, such as elbow=-30deg..30deg"),
-        ("elbow=3..5deg", "--range elbow=3..5deg: '3' has no unit; write an angle with its unit"),
-        ("elbow=5deg..3deg", "--range elbow=5deg..3deg: set HIGHEST at least 2 deg above LOWEST"),
-        ("elbow=nan deg..3deg", "--range elbow=nan deg..3deg: "),
+        ("elbow", "write JOINT=LOWEST..HIGHEST, such as elbow=-30deg..30deg"),
+        ("elbow=3deg", "write JOINT=LOWEST..HIGHEST, such as elbow=-30deg..30deg"),
+        ("elbow=3..5deg", "'3' has no unit; write an angle with its unit"),
+        ("elbow=5deg..3deg", "set HIGHEST at least 2 deg above LOWEST"),
+        ("elbow=nan deg..3deg", ""),
     ],
 )
 def test_wrong_words_are_refused(word, sentence):
     with pytest.raises(InputError) as caught:
         parse_ranges([word, "wrist"])
     first, second = caught.value.sentences
-    assert first.startswith(sentence)
+    assert first.startswith(f"--range {word}: {sentence}")
     assert second.startswith("--range wrist: ")
     with pytest.raises(InputError, match="--range a is given twice; give it once"):
         parse_ranges(["a=1deg..9deg", "a=1deg..9deg"])
@@ -108,9 +115,9 @@ def test_wrong_names_are_refused(rig):
 
 
 def test_words_are_a_robot_file_its_arguments_and_joints():
-    assert RobotFileArguments.parse_words(["a.yaml", "port:=sim", "x", "y"]) == RobotFileArguments(
-        Path("a.yaml"), ("port:=sim",), ("x", "y")
-    )
-    assert RobotFileArguments.parse_words(["x", "y"]) == RobotFileArguments(None, (), ("x", "y"))
+    parse = RobotFileArguments.parse_words
+    words = RobotFileArguments(Path("a.yaml"), ("port:=sim",), ("x", "y"))
+    assert parse(["a.yaml", "port:=sim", "x", "y"]) == words
+    assert parse(["x", "y"]) == RobotFileArguments(None, (), ("x", "y"))
     with pytest.raises(InputError, match="port:=sim is an argument of a robot file, but no file is given"):
-        RobotFileArguments.parse_words(["x", "port:=sim"])
+        parse(["x", "port:=sim"])

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 from tests.kit.awaited import DEADLINE_S, until
 from tests.kit.campaigns import campaign
-from tests.kit.experiments import ROOT
+from tests.kit.experiments import ROOT, Plays, perform, sine, state_of
 
 import dxlrun
 from dxlrun.cli import main
@@ -86,18 +86,15 @@ def rig(robot):
     assert rig.close() == ()
 
 
-def two(stage: Any) -> Callable[[ExperimentJoint], Iterator[Segment]]:
-    def segments(joint: ExperimentJoint) -> Iterator[Segment]:
-        yield stage.sine(joint, 100, 0.5, settle_s=0.1)
-        yield stage.sine(joint, 50, 0.5, loop_rate=50)
-
-    return segments
+def two(joint: ExperimentJoint) -> Iterator[Segment]:
+    yield sine(joint, 100, 0.5, settle_s=0.1)
+    yield sine(joint, 50, 0.5, loop_rate=50)
 
 
-def test_a_running_robot_is_recorded_by_its_log_and_left_as_it_was(rig, stage):
-    before = stage.state(rig)
-    plays, done = stage.perform(rig, "tilt", two(stage))
-    assert stage.state(rig) == before
+def test_a_running_robot_is_recorded_by_its_log_and_left_as_it_was(rig):
+    before = state_of(rig)
+    plays, done = perform(rig, "tilt", two)
+    assert state_of(rig) == before
     assert (done.why, len(plays.got)) == ("", 2)
     log = read_log(rig.log)
     for got, expected_s in zip(plays.got, (0.6, 0.5), strict=True):
@@ -136,12 +133,12 @@ def test_a_paused_robot_and_a_second_experiment_are_refused(rig, robot):
     assert not rig.paused
 
 
-def test_of_two_experiments_that_begin_at_once_one_is_refused(rig, robot, stage):
+def test_of_two_experiments_that_begin_at_once_one_is_refused(rig, robot):
     situation = situation_of(rig, ["tilt"], {})
     rig.load_controller("experiment_position", {"type": "sample_player", "joints": ["tilt"]})
-    before = stage.state(rig)
-    done = perform_experiment(rig, stage.Plays(two(stage)), situation)
-    assert (done.recorded, done.not_restored, stage.state(rig)) == ((), (), before)
+    before = state_of(rig)
+    done = perform_experiment(rig, Plays(two), situation)
+    assert (done.recorded, done.not_restored, state_of(rig)) == ((), (), before)
     assert "experiment_position" in done.why
     rig.unload_controller("experiment_position")
 
@@ -167,7 +164,7 @@ def test_a_robot_without_its_whole_log_is_refused(tmp_path, monkeypatch, capsys)
     assert f"{file} deletes the oldest parts of its log" in capsys.readouterr().err
 
 
-def test_a_key_is_an_abort_with_the_rest_kept(robot, stage, monkeypatch, capsys):
+def test_a_key_is_an_abort_with_the_rest_kept(robot, monkeypatch, capsys):
     """Of the whole command; any key on a terminal, which is as it was afterwards."""
     import pty
     import termios
@@ -178,14 +175,14 @@ def test_a_key_is_an_abort_with_the_rest_kept(robot, stage, monkeypatch, capsys)
         monkeypatch.setattr(sys, "stdin", terminal)
 
         def segments(joint):
-            yield stage.sine(joint, 100, 0.1)
+            yield sine(joint, 100, 0.1)
             threading.Timer(1.2, os.write, (ours, b"x")).start()
-            yield stage.sine(joint, 100, 30.0)
+            yield sine(joint, 100, 30.0)
 
         looking = live_rig(dxlrun.connect("pair"))
-        state = stage.state(looking)
-        ran = run_on_robot(stage.Plays(segments), ["tilt"], ExperimentOptions(range=("tilt=-15deg..15deg",)))
-        assert stage.state(looking) == state
+        state = state_of(looking)
+        ran = run_on_robot(Plays(segments), ["tilt"], ExperimentOptions(range=("tilt=-15deg..15deg",)))
+        assert state_of(looking) == state
         looking.close()
     assert (ran.why, ran.result, ran.exit_code) == ("aborted by a key", 2, 130)
     said = capsys.readouterr().err
@@ -204,16 +201,16 @@ def hangup() -> Iterator[None]:
     signal.signal(signal.SIGHUP, before)
 
 
-def test_a_run_of_its_own_frees_the_joint_and_ends_in_order_by_a_signal(place, stage, capsys, hangup):
+def test_a_run_of_its_own_frees_the_joint_and_ends_in_order_by_a_signal(place, capsys, hangup):
     """With the robot of the other tests beside it: two runs of the same robot."""
     others = set(sockets())
 
     def signalled(joint):
-        yield stage.sine(joint, 50, 0.2, loop_rate=50)
+        yield sine(joint, 50, 0.2, loop_rate=50)
         threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGHUP)).start()
-        yield stage.sine(joint, 50, 30.0, loop_rate=50)
+        yield sine(joint, 50, 30.0, loop_rate=50)
 
-    plays = stage.Plays(signalled)
+    plays = Plays(signalled)
     ran = run_on_robot(plays, ["pair.yaml", "pan"])
     assert (ran.robot, ran.exit_code, ran.why, len(plays.got)) == ("pair", 130, "aborted by SIGHUP", 1)
     assert ran.problems == ()
@@ -222,11 +219,11 @@ def test_a_run_of_its_own_frees_the_joint_and_ends_in_order_by_a_signal(place, s
     assert signal.getsignal(signal.SIGHUP) is signal.SIG_DFL
 
 
-def test_a_run_that_cannot_begin_says_why(place, stage):
+def test_a_run_that_cannot_begin_says_why(place):
     (place / "gone.yaml").write_text(
         ROBOT.replace("port: sim", "port: /dev/no_such_port, adapter: {latency: 1 ms}")
     )
-    plays = stage.Plays(lambda joint: iter([stage.sine(joint)]))
+    plays = Plays(lambda joint: iter([sine(joint)]))
     with pytest.raises(DxlrunError, match=r"^port /dev/no_such_port not found"):
         run_on_robot(plays, ["gone.yaml", "pan"], ExperimentOptions(yes=True))
     (place / "wrong.yaml").write_text(ROBOT.replace("rate: 100", "rat: 100").replace("id: 7", "id: 3"))
@@ -235,13 +232,13 @@ def test_a_run_that_cannot_begin_says_why(place, stage):
     assert {problem.mark.line for problem in caught.value.problems} == {4}
 
 
-def test_a_part_without_a_result_is_one_more_sentence(place, stage, capsys):
-    class Asks(stage.Plays):
+def test_a_part_without_a_result_is_one_more_sentence(place, capsys):
+    class Asks(Plays):
         def evaluate_recordings(self, *_):
             raise InputError("too short")
 
     def gives_up(joint):
-        yield stage.sine(joint, 100, 0.1)
+        yield sine(joint, 100, 0.1)
         raise DxlrunError("no two responses are alike")
 
     ran = run_on_robot(Asks(gives_up), ["pair.yaml", "pan"], ExperimentOptions(virtual=True))
@@ -252,17 +249,17 @@ def test_a_part_without_a_result_is_one_more_sentence(place, stage, capsys):
     ]
     with pytest.raises(InputError, match="too short"):
         run_on_robot(
-            Asks(lambda joint: iter([stage.sine(joint, 100, 0.1)])),
+            Asks(lambda joint: iter([sine(joint, 100, 0.1)])),
             ["pair.yaml", "pan"],
             ExperimentOptions(virtual=True),
         )
 
 
-def test_real_servos_are_asked_for_and_counted_down(place, stage, monkeypatch, capsys):
+def test_real_servos_are_asked_for_and_counted_down(place, monkeypatch, capsys):
     """A simulated robot whose ports are taken for real ones."""
     monkeypatch.setattr(on_robot, "_real", lambda plan, options: True)
     monkeypatch.setattr(on_robot, "COUNTDOWN_S", (3, 0.1))
-    plays = stage.Plays(lambda joint: iter([stage.sine(joint, 100, 0.1)]))
+    plays = Plays(lambda joint: iter([sine(joint, 100, 0.1)]))
     with open(os.devnull) as nothing:
         monkeypatch.setattr(sys, "stdin", nothing)
         ran = run_on_robot(plays, ["pair.yaml", "pan"], ExperimentOptions(virtual=True, yes=True))
@@ -273,11 +270,11 @@ def test_real_servos_are_asked_for_and_counted_down(place, stage, monkeypatch, c
 
 
 @pytest.mark.parametrize("answer", [b"n\n", b"\n", b"", None])
-def test_without_a_yes_no_run_is_started(place, stage, monkeypatch, capsys, answer):
+def test_without_a_yes_no_run_is_started(place, monkeypatch, capsys, answer):
     """A run switches torque on, so the question comes before it; b"": Ctrl-C at it, None: no terminal."""
     monkeypatch.setattr(on_robot, "_real", lambda plan, options: True)
     logs, ran = set(place.glob("logs/*")), None
-    plays = stage.Plays(lambda joint: iter([stage.sine(joint, 100, 0.1)]))
+    plays = Plays(lambda joint: iter([sine(joint, 100, 0.1)]))
     ours, theirs = os.openpty()
     with open(os.devnull if answer is None else theirs) as stdin:
         monkeypatch.setattr(sys, "stdin", stdin)
@@ -366,18 +363,18 @@ def test_a_signal_in_the_middle_of_an_import_is_taken(monkeypatch):
         assert aborting() == "aborted by Ctrl-C"
 
 
-def test_an_experiment_whose_gateway_dies_says_that_nothing_was_put_back(robot, stage, capsys):
+def test_an_experiment_whose_gateway_dies_says_that_nothing_was_put_back(robot, capsys):
     """The last test of the robot of the others, which goes on without one."""
 
     def kill_gateway(joint):
-        yield stage.sine(joint, 100, 0.2)
+        yield sine(joint, 100, 0.2)
         with socket.socket(socket.AF_UNIX) as probe:
             probe.connect(str(sockets()["pair"]))
             credentials = probe.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12)
         os.kill(struct.unpack("=3i", credentials)[0], signal.SIGKILL)
-        yield stage.sine(joint, 100, 1.0)
+        yield sine(joint, 100, 1.0)
 
-    plays = stage.Plays(kill_gateway)
+    plays = Plays(kill_gateway)
     ran = run_on_robot(plays, ["tilt"])
     assert (ran.robot, ran.exit_code, len(plays.got)) == ("pair", 1, 1)
     assert "the run of pair" in ran.why

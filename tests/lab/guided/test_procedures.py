@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from tests.kit.experiments import ROBOTS, perform, sine
 
 from dxlrun.log.log_reader import read_log
 from dxlrun_lab.guided.segment import Guard, Segment
@@ -11,9 +12,9 @@ from dxlrun_lab.guided.segment import Guard, Segment
 pytestmark = pytest.mark.long
 
 
-def test_a_segment_is_recorded_cycle_by_cycle_from_its_first_row_to_its_end(stage):
-    rig = stage.rig(stage.single)
-    plays, done = stage.perform(rig, "joint", lambda joint: iter([stage.sine(joint, settle_s=0.1)]))
+def test_a_segment_is_recorded_cycle_by_cycle_as_in_the_log(own_rig, tmp_path):
+    rig = own_rig(ROBOTS / "single_joint.yaml")
+    plays, done = perform(rig, "joint", lambda joint: iter([sine(joint, settle_s=0.1)]))
     (got,) = plays.got
     assert done.recorded == (got,)
     assert len(got) == 320 + 32 + 1
@@ -24,69 +25,51 @@ def test_a_segment_is_recorded_cycle_by_cycle_from_its_first_row_to_its_end(stag
     assert got.valid.all()
     assert (got.of_joints("voltage")[-1, 0], got.of_joints("temperature")[-1, 0]) == (12.0, 30.0)
     assert 0.2 - 0.05 < got.position.max() < 0.2 + 0.01
-
-
-def test_the_columns_are_those_of_the_log(stage, tmp_path):
-    rig = stage.rig(stage.single)
-    plays, _ = stage.perform(rig, "joint", lambda joint: iter([stage.sine(joint)]))
     rig.close()
     log = read_log(tmp_path / "0.mcap")
-    got = plays.got[0]
     rows = np.isin(log.cycles["cycle"], got.of_cycles("cycle"))
     for name in ("cycle", "woken_ns", "written_ns", "position", "age_ns", "valid"):
         assert np.array_equal(log.cycles[name][rows], got.cycles[name]), name
     assert np.array_equal(log.cycles["goal_position"][rows, :1], got.goal)
-    (accepted,) = [event for event in log.events if event.name == "goal_accepted"]
-    (ended,) = [event for event in log.events if event.name == "goal_ended"]
-    assert got.of_cycles("woken_ns")[0] <= accepted.t_ns <= got.of_cycles("written_ns")[0]
-    assert got.of_cycles("woken_ns")[-1] <= ended.t_ns <= got.of_cycles("written_ns")[-1]
+    for cycle, name in ((0, "goal_accepted"), (-1, "goal_ended")):
+        (event,) = [event for event in log.events if event.name == name]
+        assert got.of_cycles("woken_ns")[cycle] <= event.t_ns <= got.of_cycles("written_ns")[cycle]
 
 
-def test_a_long_table_at_another_rate_goes_in_pieces(stage):
+def test_a_long_table_at_another_rate_is_sent_in_pieces(single):
     """As many rows as 60 s at 320 Hz, as an identification needs; the loop runs at a fifth of its rate."""
-    rig = stage.rig(stage.single)
     rows = 0.2 * np.sin(np.arange(19_200) / 1000.0)
-
-    def segments(joint):
-        yield Segment("long", 1 / 3200, {joint.name: joint.middle + rows}, loop_rate=64)
-
-    plays, _ = stage.perform(rig, "joint", segments)
+    segment = Segment("long", 1 / 3200, {"joint": rows}, loop_rate=64)
+    plays, _ = perform(single, "joint", lambda joint: iter([segment]))
     (got,) = plays.got
     assert len(got) == 385
     assert np.abs(got.goal[:384, 0] - rows[::50]).max() < 1e-9
 
 
-def test_a_mode_that_a_servo_does_not_have_comes_back_to_the_procedure(stage):
-    rows = {"joint": np.zeros(3)}
-    plays, done = stage.perform(
-        stage.rig(stage.single), "joint", lambda joint: iter([Segment("v", 0.01, rows, interface="pwm")])
-    )
+def test_what_the_run_refuses_returns_to_the_procedure(single, arm):
+    pwm = Segment("v", 0.01, {"joint": np.zeros(3)}, interface="pwm")
+    plays, done = perform(single, "joint", lambda joint: iter([pwm]))
     assert plays.refused == ["joint joint (ID 1 on bus main) has no pwm mode: MX-64 lacks the mode"]
     assert (done.why, done.recorded) == ("", ())
-
-
-def test_a_rate_that_the_run_refuses_comes_back_to_the_procedure(stage):
-    plays, done = stage.perform(
-        stage.rig(stage.arm),
-        "elbow",
-        lambda joint: iter([stage.sine(joint, loop_rate=160), stage.sine(joint, loop_rate=200)]),
-    )
+    rates = (160, 200)
+    plays, done = perform(arm, "elbow", lambda joint: (sine(joint, loop_rate=rate) for rate in rates))
     assert plays.refused == [
         "160 Hz is not a multiple of 50 Hz, the rate of controller joint_state_broadcaster"
     ]
     assert (done.why, len(plays.got)) == ("", 1)
 
 
-def test_interfaces_follow_each_other_and_the_chain_is_active_again(stage):
-    def segments(joint):
-        yield stage.sine(joint, 400)
-        yield Segment("push", 1 / 400, {joint.name: np.full(100, 0.05)}, interface="effort")
-        yield Segment("turn", 1 / 400, {joint.name: np.full(100, -0.5)}, interface="velocity")
-        yield Segment(
-            "voltage", 1 / 400, {joint.name: np.full(40, 0.1)}, interface="pwm", begin={joint.name: 0.2}
-        )
+def test_interfaces_follow_each_other_and_the_chain_is_active_again(arm):
+    def constant(name, value, rows, **more):
+        return Segment(name, 1 / 400, {"elbow": np.full(rows, value)}, interface=name, **more)
 
-    plays, done = stage.perform(stage.rig(stage.arm), "elbow", segments)
+    def segments(joint):
+        yield sine(joint, 400)
+        yield constant("effort", 0.05, 100)
+        yield constant("velocity", -0.5, 100)
+        yield constant("pwm", 0.1, 40, begin={"elbow": 0.2})
+
+    plays, done = perform(arm, "elbow", segments)
     assert done.why == ""
     push, turn, voltage = plays.got[1:]
     assert push.goal[:100, 0].tolist() == pytest.approx([0.05] * 100, abs=0.002)
@@ -95,29 +78,24 @@ def test_interfaces_follow_each_other_and_the_chain_is_active_again(stage):
     assert (voltage.goal[:40, 0] > 0.09).all()
 
 
-def test_joints_are_led_to_the_first_row_slowly_and_back_at_the_end(stage):
-    rig = stage.rig(stage.single)
+def test_joints_are_led_to_the_first_row_slowly_and_back(single):
     places = []
-    rig.robot.link.each_cycle = lambda cycle: places.append(
-        float(rig.robot.link.simulated.record.goals.position[0])
-    )
-
-    def segments(joint):
-        yield Segment("far", 1 / 320, {joint.name: np.full(10, joint.upper)})
-
-    plays, _ = stage.perform(rig, "joint", segments)
+    goals = single.robot.link.simulated.record.goals
+    single.robot.link.each_cycle = lambda cycle: places.append(float(goals.position[0]))
+    far = Segment("far", 1 / 320, {"joint": np.full(10, np.radians(30))})
+    plays, _ = perform(single, "joint", lambda joint: iter([far]))
     assert plays.got[0].goal[0, 0] == pytest.approx(np.radians(30))
     assert np.abs(np.diff(places)).max() * 50 < 0.55, "rows of an approach are 20 ms apart"
     assert places[-1] == pytest.approx(0.0, abs=0.006)
 
 
-def test_a_joint_that_leaves_its_range_ends_the_experiment_and_the_rest_is_kept(stage):
+def test_a_joint_that_leaves_its_range_ends_the_experiment_and_the_rest_is_kept(own_rig):
     def segments(joint):
-        yield stage.sine(joint, 400)
+        yield sine(joint, 400)
         yield Segment("push", 1 / 400, {joint.name: np.full(4000, 0.9)}, interface="effort")
         raise AssertionError("nothing follows")
 
-    plays, done = stage.perform(stage.rig(stage.arm), "elbow", segments)
+    plays, done = perform(own_rig(ROBOTS / "effort_arm.yaml"), "elbow", segments)
     assert "joint elbow is at 0.5" in done.why
     assert "outside its range of -0.5236 to 0.5236 rad" in done.why
     assert [part.outcome for part in done.recorded] == ["reached", "aborted"]
@@ -132,17 +110,15 @@ def test_a_joint_that_leaves_its_range_ends_the_experiment_and_the_rest_is_kept(
         (Guard(effort=0.01), "joint elbow exerts"),
     ],
 )
-def test_the_guard_of_a_segment_ends_it(stage, guard, sentence):
-    _, done = stage.perform(
-        stage.rig(stage.arm), "elbow", lambda joint: iter([stage.sine(joint, 400, guard=guard)])
-    )
+def test_the_guard_of_a_segment_ends_it(arm, guard, sentence):
+    _, done = perform(arm, "elbow", lambda joint: iter([sine(joint, 400, guard=guard)]))
     assert sentence in done.why
     assert not done.recorded[0].whole
 
 
-def test_two_performances_are_the_same(stage):
+def test_two_performances_are_the_same(own_rig):
     first, second = (
-        stage.perform(stage.rig(stage.arm), "elbow", lambda joint: iter([stage.sine(joint)]))[0]
+        perform(own_rig(ROBOTS / "effort_arm.yaml"), "elbow", lambda joint: iter([sine(joint)]))[0]
         for _ in range(2)
     )
     assert first.got[0].cycles.tobytes() == second.got[0].cycles.tobytes()
