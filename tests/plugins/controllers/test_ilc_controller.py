@@ -1,5 +1,5 @@
-"""ilc_controller: the error of a repeated motion falls, whatever happens the correction stays small, and what
-was learned goes on in the next run. Plants are a delay and a lag with ticks; the law is computed twice."""
+"""ilc_controller: the error of a repeated motion falls, the correction stays small whatever happens, and the
+next run continues with what was learned. Plants are a delay and a lag with ticks; the law is computed twice."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import random
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,9 +25,10 @@ PERIOD_S = 0.02
 TICK = math.radians(0.088)
 MOTION_S = 4.0
 MOST = math.radians(10)
+TWO = {"joints": ["a", "b"]}
 
 
-def points(phase: float = 0.0) -> list[dict[str, object]]:
+def points(phase: float = 0.0) -> list[dict[str, Any]]:
     """Return a motion that begins and ends at rest, of two joints."""
     times = np.linspace(0.0, MOTION_S, 41)
     wave = np.sin(np.pi * times / MOTION_S) ** 2
@@ -56,19 +58,31 @@ class Servos:
 class Learner:
     """A controller on its servos, cycle by cycle."""
 
-    def __init__(self, servos: Servos | None = None, kept: bytes = b"", **more: object) -> None:
-        parameters = {"joints": ["a", "b"], **more}
-        self.stage = Stage(IlcController, parameters, present=(0.0, 0.0), kept=kept)
-        self.servos = servos or Servos()
-        self.cycle = 0
-        self.stage.activate()
+    def __init__(  # noqa: PLR0913  options of its stage, and keys
+        self,
+        servos: Servos | None = None,
+        *,
+        kept: bytes = b"",
+        into: tuple[str, ...] = (),
+        limits: dict[str, float] | None = None,
+        repeated: int = 0,
+        **keys: object,
+    ) -> None:
+        options: dict[str, Any] = {"present": (0.0, 0.0), "kept": kept, "into": into, "limits": limits or {}}
+        self.stage = Stage(IlcController, {**TWO, **keys}, **options).activate()
+        self.servos, self.cycle, self.said = servos or Servos(), 0, self.stage.said
         self.corrections: list[np.ndarray] = []
         self.commanded: list[np.ndarray] = []
         self.speeds: list[np.ndarray] = []
+        self.errors = [self.repeat() for _ in range(repeated)]
 
     @property
     def now_s(self) -> float:
         return self.cycle * PERIOD_S
+
+    @property
+    def learned(self) -> list[Any]:
+        return self.stage.controller._known._known
 
     def run(self, seconds: float) -> None:
         for _ in range(round(seconds / PERIOD_S)):
@@ -79,67 +93,68 @@ class Learner:
             self.stage.states.position[:] = self.servos.move(commanded)
             self.cycle += 1
 
+    def send(self, start_in: float = 0.5, given: list[dict[str, Any]] | None = None, **more: object) -> None:
+        trajectory = points() if given is None else given
+        self.stage.send(self.now_s, "trajectory", points=trajectory, start_in=start_in, **more)
+
     def repeat(self, phase: float = 0.0, rest_s: float = 1.5, start_in: float = 0.5) -> float:
         """Play the motion once; return its error by the newest message, deg."""
-        self.stage.send(self.now_s, "trajectory", points=points(phase), start_in=start_in)
+        self.send(start_in, points(phase))
         self.run(start_in + MOTION_S + rest_s)
         return math.degrees(self.stage.messages[-1][1].error) if self.stage.messages else math.nan
 
 
 @pytest.mark.parametrize("interface", ["position", "posvel"])
 def test_the_error_falls_tenfold_in_ten_repetitions(interface: str) -> None:
-    learner = Learner(command_interface=interface)
-    errors = [learner.repeat() for _ in range(11)]
+    learner = Learner(command_interface=interface, repeated=11)
+    errors = learner.errors
     assert errors[0] > 3.0
     assert errors[10] < errors[0] / 10
     assert max(errors[5:]) < errors[0] / 8
-    assert [message.repetition for _, message in learner.stage.messages] == list(range(11))
-    assert learner.stage.said == [
-        f"motion {learner.stage.messages[0][1].motion} is not learned yet: no correction"
-    ]
+    messages = [message for _, message in learner.stage.messages]
+    assert [message.repetition for message in messages] == list(range(11))
+    assert learner.said == [f"motion {messages[0].motion} is not learned yet: no correction"]
 
 
 def test_without_a_gain_nothing_is_learned() -> None:
-    learner = Learner(gain=0.0)
-    first, second = learner.repeat(), learner.repeat()
-    assert second == pytest.approx(first, rel=0.01)
+    learner = Learner(gain=0.0, repeated=2)
+    assert learner.errors[1] == pytest.approx(learner.errors[0], rel=0.01)
     assert not learner.stage.keeps
     assert not np.any(learner.corrections)
 
 
-def test_the_delay_is_that_of_the_first_repetition() -> None:
-    learner = Learner(Servos(delay=3, lag_s=0.001))
-    learner.repeat()
-    (motion,) = learner.stage.controller._known._known
-    # a goal is sent at the end of its cycle and read at the begin of another: one more cycle than the servo's
-    assert motion.delay_s == pytest.approx([4 * PERIOD_S] * 2, rel=0.1)
-    given = Learner(Servos(delay=3), delay="30 ms")
-    given.repeat()
-    assert given.stage.controller._known._known[0].delay_s == pytest.approx([0.03, 0.03])
+@pytest.mark.parametrize(("keys", "delay_s"), [({}, 4 * PERIOD_S), ({"delay": "30 ms"}, 0.03)])
+def test_the_delay_is_that_of_the_first_repetition_unless_it_is_given(keys: Any, delay_s: float) -> None:
+    learner = Learner(Servos(delay=3, lag_s=0.001), repeated=1, **keys)
+    # a goal is sent at the end of its cycle and read at the start of another: one cycle more than the servo's
+    assert learner.learned[0].delay_s == pytest.approx([delay_s] * 2, rel=0.1)
 
 
 # Servos that are swapped
 
 OTHERS = {
-    "slower": Servos(delay=2, lag_s=0.12),
-    "quicker": Servos(delay=0, lag_s=0.005),
-    "later": Servos(delay=9),
-    "leads": Servos(gain=1.15),
-    "lazy": Servos(gain=0.6),
-    "backward": Servos(gain=-1.0),
-    "dead": Servos(gain=0.0),
+    "slower": {"delay": 2, "lag_s": 0.12},
+    "quicker": {"delay": 0, "lag_s": 0.005},
+    "later": {"delay": 9},
+    "leads": {"gain": 1.15},
+    "lazy": {"gain": 0.6},
+    "backward": {"gain": -1.0},
+    "dead": {"gain": 0.0},
 }
 
 
-@pytest.mark.parametrize("name", list(OTHERS))
-def test_a_swapped_servo_never_lets_the_error_grow_without_bound(name: str) -> None:
-    other = OTHERS[name]
-    fresh = Learner(Servos(other.delay, other.lag_s, other.gain), gain=0.0).repeat()
-    learner = Learner()
-    for _ in range(6):
-        learner.repeat()
-    learner.servos = Servos(other.delay, other.lag_s, other.gain, learner.servos.position)
-    errors = [learner.repeat() for _ in range(14)]
+@pytest.fixture(scope="module")
+def taught() -> bytes:
+    """Return what a controller keeps after six repetitions."""
+    kept: bytes = Learner(repeated=6).stage.keeps[-1]
+    return kept
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_a_swapped_servo_never_lets_the_error_grow_without_bound(name: str, taught: bytes) -> None:
+    (fresh,) = Learner(Servos(**OTHERS[name]), gain=0.0, repeated=1).errors
+    learner = Learner(Servos(**OTHERS[name]), kept=taught, repeated=14)
+    errors = learner.errors
     assert np.abs(learner.corrections).max() <= MOST + 1e-9
     # what was learned on the other servo makes it worse by that correction at most, and only twice
     assert max(errors) < fresh + math.degrees(MOST)
@@ -147,116 +162,96 @@ def test_a_swapped_servo_never_lets_the_error_grow_without_bound(name: str) -> N
     assert min(errors[-3:]) < 1.1 * fresh
     if name in ("slower", "quicker", "later"):
         assert max(errors[-3:]) < fresh / 2
-    assert any("is dropped" in text for text in learner.stage.said) == (errors[0] > 0 and _twice(errors))
+    # two errors in a row of more than twice the smallest one, which was 0.3 before
+    twice = any(min(pair) > 2 * 0.3 for pair in itertools.pairwise(errors))
+    assert any("is dropped" in text for text in learner.said) == (errors[0] > 0 and twice)
 
 
-def _twice(errors: list[float]) -> bool:
-    """Return whether two errors in a row were more than twice the smallest one, which was 0.3 before."""
-    return any(min(pair) > 2 * 0.3 for pair in itertools.pairwise(errors))
-
-
-def test_one_bad_repetition_is_left_out_and_a_second_one_drops_what_was_learned() -> None:
-    learner = Learner()
-    for _ in range(6):
-        learner.repeat()
-    before = learner.stage.keeps[-1]
-    count = len(learner.stage.keeps)
+def test_one_bad_repetition_is_ignored_and_a_second_one_drops_what_was_learned() -> None:
+    learner = Learner(repeated=6)
+    before, count = learner.stage.keeps[-1], len(learner.stage.keeps)
     learner.servos.gain = 0.5
     learner.repeat()
     learner.servos.gain = 1.0
-    assert "nothing is learned" in learner.stage.said[-1]
+    assert "nothing is learned" in learner.said[-1]
     assert learner.stage.keeps[-1] == before
     assert learner.repeat() < 0.5, "the correction is still there"
     learner.servos.gain = 0.5
     learner.repeat()
     learner.repeat()
-    assert "is dropped: again its error" in learner.stage.said[-1]
-    assert learner.stage.controller._known._known == []
+    assert "is dropped: again its error" in learner.said[-1]
+    assert learner.learned == []
     assert len(learner.stage.keeps) == count + 2
 
 
-# What nothing is learned from
+# Repetitions from which nothing is learned
 
 
-def lost_cycle(learner: Learner) -> None:
-    learner.run(2.0)
+def skip_a_cycle(learner: Learner) -> None:
     learner.cycle += 1
-    learner.run(4.0)
 
 
-def lost_reply(learner: Learner) -> None:
-    valid = learner.stage.states.valid
-    learner.run(2.0)
-    valid[1] = False
+def lose_a_reply(learner: Learner) -> None:
+    learner.stage.states.valid[1] = False
     learner.run(PERIOD_S)
-    valid[1] = True
-    learner.run(4.0)
+    learner.stage.states.valid[1] = True
 
 
-def clamped(learner: Learner) -> None:
-    learner.run(2.0)
+def clamp_a_goal(learner: Learner) -> None:
     learner.stage.sent.position[0] += 0.001
-    learner.run(4.0)
 
 
-def cancelled(learner: Learner) -> None:
-    learner.run(2.0)
+def cancel(learner: Learner) -> None:
     learner.stage.cancel(learner.now_s)
-    learner.run(4.0)
 
 
-def preempted(learner: Learner) -> None:
-    learner.run(2.0)
+def preempt(learner: Learner) -> None:
     learner.repeat(phase=1.0)
 
 
-def slower(learner: Learner) -> None:
-    learner.run(2.0)
+def slow_down(learner: Learner) -> None:
     learner.stage.change(learner.now_s, speed=0.5)
-    learner.run(8.0)
-
-
-def deactivated(learner: Learner) -> None:
-    learner.run(2.0)
-    learner.stage.controller.on_deactivate(round(learner.now_s * 1e9))
-    learner.stage.controller.on_activate(round(learner.now_s * 1e9))
     learner.run(4.0)
 
 
+def activate_again(learner: Learner) -> None:
+    learner.stage.controller.on_deactivate(round(learner.now_s * 1e9))
+    learner.stage.controller.on_activate(round(learner.now_s * 1e9))
+
+
 @pytest.mark.parametrize(
-    ("happens", "why"),
+    ("happen", "why"),
     [
-        (lost_cycle, "cycles were skipped"),
-        (lost_reply, "a servo did not answer"),
-        (clamped, "its goals were clamped"),
-        (cancelled, "it was not played to its end"),
-        (preempted, "it was not played to its end"),
-        (slower, "it is played at another speed"),
-        (deactivated, "it was not played to its end"),
+        (skip_a_cycle, "cycles were skipped"),
+        (lose_a_reply, "a servo did not answer"),
+        (clamp_a_goal, "its goals were clamped"),
+        (cancel, "it was not played to its end"),
+        (preempt, "it was not played to its end"),
+        (slow_down, "it is played at another speed"),
+        (activate_again, "it was not played to its end"),
     ],
 )
-def test_a_repetition_that_was_disturbed_is_left_out(happens: Callable[[Learner], None], why: str) -> None:
-    learner = Learner()
-    first = learner.repeat()
-    learner.repeat()
+def test_a_repetition_that_was_disturbed_is_ignored(happen: Callable[[Learner], None], why: str) -> None:
+    learner = Learner(repeated=2)
     name, table = learner.stage.messages[0][1].motion, learner.stage.keeps[-1]
-    learner.stage.send(learner.now_s, "trajectory", points=points(), start_in=0.5)
-    happens(learner)
-    assert [text for text in learner.stage.said if "nothing is learned" in text] == [
+    learner.send()
+    learner.run(2.0)
+    happen(learner)
+    learner.run(4.0)
+    assert [text for text in learner.said if "nothing is learned" in text] == [
         f"nothing is learned from this repetition of motion {name}: {why}"
     ]
-    if happens is not preempted:
+    if happen is not preempt:
         assert learner.stage.keeps[-1] == table
     learner.stage.change(learner.now_s, speed=1.0)
     learner.run(1.0)
-    assert learner.repeat() < first / 2, "and the next one is played and learned from as before"
+    assert learner.repeat() < learner.errors[0] / 2, "the next one is played and learned from as before"
 
 
 def test_a_motion_that_is_too_long_is_played_and_not_learned() -> None:
-    learner = Learner(longest="3 s")
-    learner.repeat()
-    assert learner.stage.goal.ended[0][0] is Outcome.REACHED
-    assert "it is longer than `longest`" in learner.stage.said[-1]
+    learner = Learner(longest="3 s", repeated=1)
+    assert learner.stage.goal.outcome is Outcome.REACHED
+    assert "it is longer than `longest`" in learner.said[-1]
     assert not learner.stage.messages
 
 
@@ -266,7 +261,7 @@ def test_a_motion_that_begins_while_the_one_before_is_learned() -> None:
     learner.stage.controller._repetition._step = 16
     errors = [learner.repeat(rest_s=0.1, start_in=0.1) for _ in range(8)]
     assert errors[-1] < errors[1] / 5, "the first is reported with the second"
-    assert any("the previous repetition is still being learned" in text for text in learner.stage.said)
+    assert any("the previous repetition is still being learned" in text for text in learner.said)
 
 
 # Motions
@@ -275,8 +270,7 @@ def test_a_motion_that_begins_while_the_one_before_is_learned() -> None:
 def test_joints_that_a_motion_does_not_move_get_no_correction() -> None:
     learner = Learner(Servos(gain=0.8, position=np.array([0.0, 0.3])))
     for _ in range(3):
-        one = [{**point, "positions": point["positions"][:1]} for point in points()]  # type: ignore[index]
-        learner.stage.send(learner.now_s, "trajectory", points=one, joints=["a"], start_in=0.5)
+        learner.send(given=[{**each, "positions": each["positions"][:1]} for each in points()], joints=["a"])
         learner.run(6.0)
     largest = np.abs(learner.corrections).max(axis=0)
     assert largest[0] > math.radians(3)
@@ -284,20 +278,16 @@ def test_joints_that_a_motion_does_not_move_get_no_correction() -> None:
 
 
 def test_a_motion_without_an_error() -> None:
-    still = [{"time": t, "positions": [0.0, 0.0]} for t in (0.0, 1.0)]
-
-    def repeat(learner: Learner) -> None:
-        learner.stage.send(learner.now_s, "trajectory", points=still, start_in=0.1)
+    def stay(learner: Learner) -> Learner:
+        learner.send(0.1, [{"time": t, "positions": [0.0, 0.0]} for t in (0.0, 1.0)])
         learner.run(2.0)
+        return learner
 
-    learner = Learner()
-    repeat(learner)
+    learner = stay(Learner())
     assert learner.stage.messages[-1][1].error == 0.0
     again = Learner(kept=learner.stage.keeps[-1])
     again.servos.position[:] = 0.5  # the arm is pushed
-    repeat(again)
-    repeat(again)
-    assert "nothing is learned" in again.stage.said[0]
+    assert "nothing is learned" in stay(stay(again)).said[0]
 
 
 def test_each_motion_has_its_own_correction_and_the_oldest_is_forgotten() -> None:
@@ -307,37 +297,35 @@ def test_each_motion_has_its_own_correction_and_the_oldest_is_forgotten() -> Non
             learner.repeat(phase)
     assert learner.repeat(0.0) < 0.6
     assert learner.repeat(1.0) < 0.6
-    assert learner.repeat(2.0) > 2.0, "a changed motion begins anew"
-    assert " is dropped for motion " in learner.stage.said[-1]
+    assert learner.repeat(2.0) > 2.0, "a changed motion is a new one"
+    assert " is dropped for motion " in learner.said[-1]
     assert learner.repeat(1.0) < 0.6
     assert learner.repeat(0.0) > 2.0, "it was forgotten"
 
 
 def test_a_motion_is_the_same_whenever_it_begins() -> None:
-    made = Stage(IlcController, {"joints": ["a", "b"]})
+    made = Stage(IlcController, TWO)
 
-    def key(**command: object) -> tuple[float, ...]:
-        return tuple(made.prepare("trajectory", **command)[-2:].tolist())
+    def key(stage: Stage = made, **command: object) -> tuple[float, ...]:
+        return tuple(stage.prepare("trajectory", **command)[-2:].tolist())
 
-    assert key(points=points(), start_in=2.0, timeout=9.0) == key(points=points())
+    own = key(points=points())
+    assert key(points=points(), start_in=2.0, timeout=9.0) == own
     others = {key(points=points(0.001)), key(points=points()[:-1]), key(points=points(), joints=["b", "a"])}
-    assert len({*others, key(points=points())}) == 4
-    posvel = Stage(IlcController, {"joints": ["a", "b"], "command_interface": "posvel"})
-    assert tuple(posvel.prepare("trajectory", points=points())[-2:].tolist()) != key(points=points())
+    others.add(key(Stage(IlcController, TWO | {"command_interface": "posvel"}), points=points()))
+    assert len(others - {own}) == 4
 
 
 @pytest.mark.parametrize("end", ["cancel", "next", "same"])
 def test_no_correction_jumps(end: str) -> None:
-    learner = Learner()
-    for _ in range(5):
-        learner.repeat()
+    learner = Learner(repeated=5)
     learner.corrections.clear()
-    learner.stage.send(learner.now_s, "trajectory", points=points(), start_in=0.5)
+    learner.send()
     learner.run(1.7)
     if end == "cancel":
         learner.stage.cancel(learner.now_s)
         learner.run(1.0)
-    learner.stage.send(learner.now_s, "trajectory", points=points(1.0 if end == "next" else 0.0))
+    learner.send(0.0, points(1.0 if end == "next" else 0.0))
     learner.run(6.0)
     steps = np.abs(np.diff(learner.corrections, axis=0))
     assert np.abs(learner.corrections).max() > math.radians(3)
@@ -346,20 +334,12 @@ def test_no_correction_jumps(end: str) -> None:
 
 @pytest.mark.parametrize("into", [(), ("below",)])
 def test_the_speed_is_that_of_the_corrected_position(into: tuple[str, ...]) -> None:
-    learner = Learner(command_interface="posvel")
-    learner.stage = Stage(
-        IlcController,
-        {"joints": ["a", "b"], "command_interface": "posvel"},
-        present=(0.0, 0.0),
-        into=into,
-    ).activate()
-    for _ in range(4):
-        learner.repeat()
+    learner = Learner(command_interface="posvel", into=into, repeated=4)
     begin = len(learner.commanded)
     learner.repeat()
     rows = slice(begin + 50, begin + 200)  # in the motion
-    gone = np.diff(learner.commanded, axis=0, prepend=[[0.0, 0.0]])[rows] / PERIOD_S
-    off = np.abs(np.array(learner.speeds)[rows] - (gone if into else np.abs(gone)))
+    speeds = np.diff(learner.commanded, axis=0, prepend=[[0.0, 0.0]])[rows] / PERIOD_S
+    off = np.abs(np.array(learner.speeds)[rows] - (speeds if into else np.abs(speeds)))
     grew = np.abs(np.diff(learner.corrections, axis=0)[rows]) / PERIOD_S
     # a linear piece ends every 5 rows: there the speed is already that of the next one
     assert np.median(off, axis=0) == pytest.approx([0.0, 0.0], abs=0.01)
@@ -367,76 +347,68 @@ def test_the_speed_is_that_of_the_corrected_position(into: tuple[str, ...]) -> N
 
 
 def test_a_correction_does_not_lead_over_a_limit() -> None:
-    parameters = {"joints": ["a", "b"]}
-    learner = Learner()
-    learner.stage = Stage(
-        IlcController, parameters, present=(0.0, 0.0), limits={"lower": -0.6, "upper": 0.6}
-    ).activate()
-    for _ in range(4):
-        learner.repeat()
+    learner = Learner(limits={"lower": -0.6, "upper": 0.6}, repeated=4)
     assert np.abs(learner.commanded).max() == 0.6
     assert np.abs(learner.corrections).max() > math.radians(3)
-    assert not any("clamped" in text for text in learner.stage.said)
+    assert not any("clamped" in text for text in learner.said)
 
 
 # From run to run
 
 
-def test_the_next_run_goes_on_with_what_was_kept() -> None:
-    learner = Learner()
-    for _ in range(4):
-        learner.repeat()
-    again = Learner(kept=learner.stage.keeps[-1])
-    errors = [again.repeat() for _ in range(2)]
-    assert errors[0] == pytest.approx(learner.repeat(), abs=0.05)
-    assert again.stage.said == []
+def test_the_next_run_continues_with_what_was_kept() -> None:
+    learner = Learner(repeated=4)
+    again = Learner(kept=learner.stage.keeps[-1], repeated=2)
+    assert again.errors[0] == pytest.approx(learner.repeat(), abs=0.05)
+    assert again.said == []
     assert again.stage.messages[0][1].repetition == 4
 
 
+@pytest.fixture(scope="module")
+def short() -> bytes:
+    """Return what a controller of one short motion keeps."""
+    kept: bytes = Learner(motions=1, longest="4.2 s", repeated=1).stage.keeps[-1]
+    return kept
+
+
 @pytest.mark.parametrize("seed", range(8))
-def test_damaged_bytes_are_left_out_and_never_raise(seed: int) -> None:
-    learner = Learner(motions=1, longest="4.2 s")
-    learner.repeat()
-    chance, data = random.Random(seed), bytearray(learner.stage.keeps[-1])
+def test_damaged_bytes_are_ignored_and_never_raise(seed: int, short: bytes) -> None:
+    chance, data = random.Random(seed), bytearray(short)
     for _ in range(chance.randint(1, 4)):
         at = chance.choice([chance.randrange(60), chance.randrange(len(data))])
         data[at] = chance.randrange(256)
     data = data[: chance.choice([len(data), chance.randrange(len(data))])]
-    again = Learner(motions=1, longest="4.2 s", kept=bytes(data))
-    again.repeat()
+    again = Learner(motions=1, longest="4.2 s", kept=bytes(data), repeated=1)
     assert np.isfinite(again.corrections).all()
     assert np.abs(again.corrections).max() <= MOST + 1e-6
 
 
-def test_another_period_begins_anew_and_says_so() -> None:
-    learner = Learner()
-    learner.repeat()
-    data = learner.stage.keeps[-1]
-    other = data[:4] + (10_000_000).to_bytes(8, "little") + data[12:]
-    again = Learner(kept=other)
-    assert again.stage.said == [
+def test_another_period_forgets_and_reports_it(short: bytes) -> None:
+    other = short[:4] + (10_000_000).to_bytes(8, "little") + short[12:]
+    again = Learner(motions=1, longest="4.2 s", kept=other)
+    assert again.said == [
         "the stored corrections cannot be used: they have a period of 10000000 ns instead of 20000000 ns"
     ]
-    assert again.stage.controller._known._known == []
+    assert again.learned == []
 
 
 def test_more_than_can_be_kept_is_refused() -> None:
     with pytest.raises(ValueError, match="lower `motions` or `longest`"):
-        Stage(IlcController, {"joints": ["a", "b"], "longest": "3000 s"})
+        Stage(IlcController, TWO | {"longest": "3000 s"})
 
 
 # The law
 
 
-def test_the_low_pass_has_no_phase_and_half_the_power_at_its_cut_off() -> None:
-    for cutoff, period in ((5.0, 1 / 320), (2.0, 0.001), (8.0, 0.02)):
-        weights = gaussian(cutoff, period)
-        turns = np.exp(-2j * np.pi * cutoff * period * (np.arange(len(weights)) - len(weights) // 2))
-        passed = np.sum(weights * turns)
-        assert abs(passed) == pytest.approx(math.sqrt(0.5), rel=0.01)
-        assert passed.imag == pytest.approx(0.0, abs=1e-12)
-        assert weights.sum() == pytest.approx(1.0)
-        assert (weights > 0).all()
+@pytest.mark.parametrize(("cutoff", "period"), [(5.0, 1 / 320), (2.0, 0.001), (8.0, 0.02)])
+def test_the_low_pass_has_no_phase_and_half_the_power_at_its_cut_off(cutoff: float, period: float) -> None:
+    weights = gaussian(cutoff, period)
+    turns = np.exp(-2j * np.pi * cutoff * period * (np.arange(len(weights)) - len(weights) // 2))
+    passed = np.sum(weights * turns)
+    assert abs(passed) == pytest.approx(math.sqrt(0.5), rel=0.01)
+    assert passed.imag == pytest.approx(0.0, abs=1e-12)
+    assert weights.sum() == pytest.approx(1.0)
+    assert (weights > 0).all()
 
 
 @pytest.mark.parametrize("rows", [3, 40, 300, 1000])
