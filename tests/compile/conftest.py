@@ -71,7 +71,9 @@ class Part(Controller[PartParameters]):
 def part_plugins(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[np.ndarray]]:
     """Offer the type `part`, to the compiler and to runs on virtual time; return what parts read."""
     for room in (robot_compiler, virtual_run):
-        monkeypatch.setattr(room, "load_plugins", lambda **_: _with_part())
+        monkeypatch.setattr(
+            room, "load_plugins", lambda **more: load_plugins(**more) if more.get("files") else _with_part()
+        )
     return READ
 
 

@@ -103,31 +103,6 @@ def test_a_motion_that_turns_a_continuous_joint_the_longer_way_is_warned_of(tmp_
         assert found == ["reel turns by 458.4 deg from one point to the next"] * warned
 
 
-@pytest.mark.parametrize(
-    ("keys", "warned"),
-    [
-        ("simulation: {gravity: 2 Nm}", "arm sags by up to 5.38 deg"),
-        ("simulation: {gravity: 5 Nm}", "arm sags far"),
-        ("simulation: {gravity: 1 Nm}", ""),
-        ("simulation: {gravity: 2 Nm}, tolerance: 8 deg", ""),
-        ("simulation: {gravity: 2 Nm}, registers: {position_p_gain: 1600}", ""),
-        ("simulation: {gravity: 2 Nm}, registers: {position_i_gain: 100}", ""),
-        ("simulation: {gravity: 2 Nm}, limits: {position: [-10 deg, 10 deg]}", ""),
-    ],
-)
-def test_a_weight_that_keeps_a_joint_beyond_its_tolerance_is_warned_of(tmp_path, keys, warned):
-    motor = Path(__file__).parents[2] / "robots/motors/XM430-W350.motor.yaml"
-    text = f"""
-name: weight{BUSES}
-loop: {{rate: 50}}
-joints: {{arm: {{id: 1, motor: {motor}, {keys}}}}}
-controllers: {{arm: {{type: joint_trajectory_controller, joints: [arm]}}}}
-"""
-    found = [text for text in warnings(written(tmp_path, text)) if "arm sags" in text]
-    assert bool(found) is bool(warned), found
-    assert warned in "".join(found)
-
-
 @pytest.mark.parametrize(("protocol", "model"), [(1.0, "MX-64"), (2.0, "XM430-W350")])
 @pytest.mark.parametrize("before_ms", [3, 12])
 def test_a_joint_that_shuts_itself_down_before_its_goal_is_judged_has_not_reached_it(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -209,98 +208,12 @@ def test_a_velocity_is_passed_on() -> None:
     assert robot.commands.velocity.tolist() == [-0.4, 0.0]
 
 
-# What is missing
+# What is missing: `tests/compile/cases/gravity.txt`
 
 
-@pytest.fixture
-def refused(tmp_path: Path) -> Callable[..., list[str]]:
-    """Return the errors of held_arm.yaml with some text of it or of its URDF replaced."""
-    files = {"yaml": "held_arm.yaml", "urdf": "urdf/held_arm.urdf", "motor": "motors/XM430-W350.motor.yaml"}
-    for name in files.values():
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        (tmp_path / name).write_text((ROBOTS / name).read_text())
-
-    def refused(kind: str = "", old: str = "", new: str = "") -> list[str]:
-        if kind:
-            path = tmp_path / files[kind]
-            text = path.read_text()
-            assert old in text
-            path.write_text(text.replace(old, new))
-        try:
-            compile_files(tmp_path / "held_arm.yaml", {}, [])
-        except InputError as error:
-            return str(error).replace(f"{tmp_path}/", "").splitlines()
-        return []
-
-    return refused
-
-
-LIMITS = "{position: [-110 deg, 110 deg], velocity: 2 rad/s}\n"
-JOINTS = "    type: gravity_compensation\n    joints: [shoulder, elbow]\n"
-
-
-@pytest.mark.needs("physics")
-@pytest.mark.parametrize(
-    ("change", "at", "what"),
-    [
-        (("yaml", "\nmodel: {urdf: urdf/held_arm.urdf}", ""), "gravity", "needs a URDF"),
-        (
-            ("urdf", '"elbow" type="revolute"', '"knee" type="revolute"'),
-            "elbow",
-            "needs elbow, but the URDF lacks it",
-        ),
-        (("urdf", '"elbow" type="revolute"', '"elbow" type="fixed"'), "elbow", "but it is fixed in the URDF"),
-        (
-            ("urdf", '"elbow" type="revolute"', '"elbow" type="prismatic"'),
-            "elbow",
-            "needs elbow to turn, but it is prismatic",
-        ),
-        (
-            ("yaml", LIMITS, "{position: [0 mm, 5 mm], velocity: 5 mm/s}\n    travel_per_turn: 20 mm\n"),
-            "shoulder",
-            "needs shoulder to slide, but it is revolute in the URDF",
-        ),
-        (("urdf", '<mass value="0.15"/>', ""), "shoulder", "the mass of forearm, moved by shoulder"),
-        (("urdf", "0.15", "-1"), "gravity", "the mass of link forearm is -1, not a number"),
-        (
-            ("yaml", JOINTS, f"{JOINTS}    payload: {{link: hnad, mass: 1 kg}}\n"),
-            "hnad",
-            "use one of base_link, upper_arm, forearm, hand",
-        ),
-        (("yaml", JOINTS, f"{JOINTS}    payload: {{link: base_link, mass: 1 kg}}\n"), "base_link", "none of"),
-        (("yaml", JOINTS, f"{JOINTS}    payload: {{link: hand, mass: 1}}\n"), "1}}", "has no unit"),
-        (
-            ("yaml", JOINTS, f"{JOINTS}    orientation: imu/orientation\n"),
-            "imu/orientation",
-            "gravity reads imu/orientation.x",
-        ),
-    ],
-)
-def test_what_is_missing_is_one_sentence_at_its_place(
-    refused: Callable[..., list[str]], tmp_path: Path, change: tuple[str, str, str], at: str, what: str
-) -> None:
-    found = [line for line in refused(*change) if "physics: mujoco" not in line]
-    lines = [line for line in found if what in line]
-    assert lines, found
-    place, row, column, *_ = lines[0].split(":")
-    text = (tmp_path / place).read_text().splitlines()[int(row) - 1]
-    assert text[int(column) - 1 :].startswith(at.replace("}}", ""))
-
-
-def test_without_mujoco_it_is_refused(
-    refused: Callable[..., list[str]], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_mujoco_it_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "mujoco" else find(name))
-    assert any(
-        "gravity needs MuJoCo, which is not installed; `pip install 'dxlrun[physics]'`" in line
-        for line in refused()
-    )
-
-
-@pytest.mark.needs("physics")
-def test_a_joint_without_a_weight_is_refused(refused: Callable[..., list[str]], tmp_path: Path) -> None:
-    for mass in ('"0.15"', '"0.25"'):
-        refused("urdf", mass, '"0"')
-    (line,) = refused()
-    assert "gravity has nothing to hold at elbow: it moves no mass in the URDF" in line
+    sentence = r"gravity needs MuJoCo, which is not installed; `pip install 'dxlrun\[physics\]'`"
+    with pytest.raises(InputError, match=sentence):
+        compile_files(ROBOTS / "held_arm.yaml", {}, [])

@@ -1,5 +1,6 @@
 """ilc_controller: the error of a repeated motion falls, the correction stays small whatever happens, and the
-next run continues with what was learned. Plants are a delay and a lag with ticks; the law is computed twice."""
+next run continues with what was learned. Plants are a delay and a lag with ticks; the law is computed twice.
+"""
 
 from __future__ import annotations
 
@@ -58,7 +59,7 @@ class Servos:
 class Learner:
     """A controller on its servos, cycle by cycle."""
 
-    def __init__(  # noqa: PLR0913  options of its stage, and keys
+    def __init__(
         self,
         servos: Servos | None = None,
         *,
