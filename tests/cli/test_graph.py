@@ -1,13 +1,10 @@
-"""`dxlrun check --graph`: the drawing in the terminal, as SVG and as DOT; the same for a running robot."""
+"""The graph of controllers and its pictures; what `dxlrun check --graph` prints is in check.txt."""
 
 from __future__ import annotations
 
 import io
-import re
-from collections.abc import Callable
 from itertools import combinations
 from pathlib import Path
-from typing import Any
 from xml.etree import ElementTree as ET
 
 import pytest
@@ -15,6 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from rich.console import Console
 from tests.kit.answers import result_of
+from tests.kit.commands import Dxlrun, cases
 
 from dxlrun.cli.steering.steer import drawing
 from dxlrun.output.graph import Edge, Graph, Node, placed
@@ -22,75 +20,22 @@ from dxlrun.output.graph_picture import graph_svg
 from dxlrun.output.graph_text import graph_text
 from dxlrun.output.terminal import show_parts
 
-Dxlrun = Callable[..., Any]
 ROBOTS = Path(__file__).parents[2] / "robots"
-CHAIN = """\
-name: chain
-buses: {main: {port: sim, protocol: 2.0, baud_rate: 1_000_000}}
-loop: {rate: 100}
-joints:
-  shoulder: {bus: main, id: 1, model: XM430-W350, reference: 180 deg, direction: 1}
-  elbow: {bus: main, id: 2, model: XM430-W350, reference: 180 deg, direction: 1}
-controllers:
-  states: {type: joint_state_broadcaster, rate: 50}
-  arm_pid: {type: pid_controller, joints: [shoulder, elbow], gains: {p: 1.0}}
-  arm: {type: joint_group_position_controller, joints: [shoulder, elbow], into: arm_pid}
-  still: {type: joint_group_position_controller, joints: [shoulder, elbow], active: false}
-"""
-DRAWN = """\
-chain: controllers
-┌─────────────────┐     ┌──────────┐         ┌──────────────────┐           ┌─────────────────┐
-│ shoulder, elbow │ ┌──▶│ states   │   ┌────▶│ arm_pid          │ ┌─┬──────▶│ shoulder, elbow │
-│          states ├─┘   │          │   │     │           effort ├─┘ │       │                 │
-└─────────────────┘     └──────────┘   │     └──────────────────┘   │       └─────────────────┘
-                        ┌──────────┐   │     ┌┄┄┄┄┄┄┄┄┄┄┄┄┄┄┄┄┄┄┐   │
-                        │ arm      │   │     ┊ still (inactive) ┊   │
-                        │ position ├───┘     ┊         position ├───┘
-                        └──────────┘         └┄┄┄┄┄┄┄┄┄┄┄┄┄┄┄┄┄┄┘
-"""
-
-
-@pytest.fixture
-def chain(tmp_path: Path) -> Path:
-    path = tmp_path / "chain.yaml"
-    path.write_text(CHAIN)
-    return path
-
-
-def squeezed(text: str) -> list[str]:
-    """Return the lines with gaps of any width alike."""
-    return [re.sub(r"([ ─])\1+", r"\1", line).strip() for line in text.strip().splitlines()]
-
-
-def test_the_graph_is_drawn_in_the_terminal(dxlrun: Dxlrun, chain: Path) -> None:
-    said = dxlrun("check", chain, "--graph")
-    assert (said.code, said.err) == (0, "")
-    verdict, _, drawn = said.out.partition("\n")
-    assert verdict.startswith("chain: good.")
-    assert squeezed(drawn) == squeezed(DRAWN)
-
-
-def test_nodes_and_edges_are_in_the_json(dxlrun: Dxlrun, chain: Path) -> None:
-    graph = result_of(dxlrun("check", chain, "--json").out)["graph"]
-    assert graph["order"] == ["states", "arm", "arm_pid", "still"]
-    assert {"name": "elbow", "kind": "joint"} in graph["nodes"]
-    assert {"name": "arm", "kind": "controller"} in graph["nodes"]
-    elbow = [(one["kind"], one["source"], one["target"]) for one in graph["edges"] if one["joint"] == "elbow"]
-    assert elbow == [
-        ("command", "arm_pid", "elbow"),
-        ("reference", "arm", "arm_pid"),
-        ("command", "still", "elbow"),
-    ]
+NODES = (
+    Node("reads", "source", ("wrist",), "temperature"),
+    Node("arm", "controller", ("arm",), "position + velocity"),
+    Node("pid", "controller", ("pid",), "effort", active=False),
+    Node("joints", "joints", ("shoulder", "elbow")),
+)
+GRAPH = Graph("three", NODES, (Edge("reads", "pid"), Edge("arm", "pid"), Edge("pid", "joints")))
 
 
 @pytest.mark.parametrize("name", ["bioloid_torso", "humanoid_20", "diff_drive"])
-def test_a_picture_of_each_robot_has_all_in_it_and_nothing_over_another(
+def test_picture_of_a_robot_has_all_in_it_and_nothing_over_another(
     dxlrun: Dxlrun, tmp_path: Path, name: str
 ) -> None:
     path = tmp_path / "graph.svg"
-    said = dxlrun("check", ROBOTS / f"{name}.yaml", "--graph", path)
-    assert said.code == 0
-    assert f"the controller graph is in {path}" in said.out
+    assert f"the controller graph is in {path}" in dxlrun("check", ROBOTS / f"{name}.yaml", "--graph", path).out
     root = ET.parse(path).getroot()  # noqa: S314  our own file
     space = "{http://www.w3.org/2000/svg}"
     controllers = result_of(dxlrun("check", ROBOTS / f"{name}.yaml", "--json").out)["controllers"]
@@ -112,59 +57,28 @@ def test_a_picture_of_each_robot_has_all_in_it_and_nothing_over_another(
     assert max(y + height for _, y, _, height in boxes) < float(root.get("height", ""))
 
 
-def test_dot_has_each_node_and_each_edge(dxlrun: Dxlrun, chain: Path, tmp_path: Path) -> None:
+def test_dot_replaces_an_older_one_and_has_each_node_and_edge(dxlrun: Dxlrun, tmp_path: Path) -> None:
+    files = cases("check.txt")[0].values[0].files
+    (tmp_path / "chain.yaml").write_text(files["chain.yaml"])
     path = tmp_path / "graph.DOT"
     path.write_text('node [fontname="monospace"]; an older one')
-    assert dxlrun("check", chain, "--graph", path).code == 0
+    assert dxlrun("check", tmp_path / "chain.yaml", "--graph", path).code == 0
     text = path.read_text()
     assert text.startswith('digraph "chain: controllers" {\n')
     assert '  "arm" -> "arm_pid" [label="position"];\n' in text
-    assert (
-        '  "still" [label="still\\njoint_group_position_controller, 100 Hz", shape=box, style=dashed];\n'
-        in text
-    )
+    label = "still\\njoint_group_position_controller, 100 Hz"
+    assert f'  "still" [label="{label}", shape=box, style=dashed];\n' in text
     assert text.count(" -> ") == 4
-    assert sorted(tmp_path.iterdir()) == [chain, path]
+    assert sorted(one.name for one in tmp_path.iterdir()) == ["chain.yaml", "graph.DOT"]
 
 
-def test_what_cannot_be_a_picture_is_refused_in_one_sentence(
-    dxlrun: Dxlrun, chain: Path, tmp_path: Path
-) -> None:
-    for words, what in (
-        ((tmp_path / "graph.png",), "the file's suffix must be .svg or .dot"),
-        (("port:=sim",), "to draw in the terminal, write --graph last"),
-        ((tmp_path / "gone" / "graph.svg",), "cannot be written (directory"),
-    ):
-        said = dxlrun("check", chain, "--graph", *words)
-        assert said.code == 2
-        assert what in said.err
-        assert said.err.count("\n") == 1
-    (tmp_path / "folder.svg").mkdir()
-    said = dxlrun("check", chain, "--graph", tmp_path / "folder.svg")
-    assert (said.code, said.err.count("\n")) == (2, 1)
-    assert "it exists and is a directory" in said.err
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["chain.yaml", "folder.svg"]
-
-
-NODES = (
-    Node("reads", "source", ("wrist",), "temperature"),
-    Node("arm", "controller", ("arm",), "position + velocity"),
-    Node("pid", "controller", ("pid",), "effort", active=False),
-    Node("joints", "joints", ("shoulder", "elbow")),
-)
-GRAPH = Graph("three", NODES, (Edge("reads", "pid"), Edge("arm", "pid"), Edge("pid", "joints")))
-
-
-def test_a_narrow_terminal_gets_a_list() -> None:
+def test_narrow_terminal_gets_a_list_that_is_broken_between_words() -> None:
     assert graph_text(GRAPH, 60) == (
         "wrist\n  temperature ─▶ pid\n"
         "arm\n  position + velocity ─▶ pid\n"
         "pid (inactive)\n  effort ─▶ shoulder elbow"
     )
     assert max(map(len, graph_text(GRAPH, 120).splitlines())) > 60
-
-
-def test_a_list_is_broken_between_words() -> None:
     joints = Node("joints", "joints", ("left_shoulder_joint, left_elbow_joint, left_wrist_joint",))
     graph = Graph("wide", (Node("arm", "controller", ("arm",), "position"), joints), (Edge("arm", "joints"),))
     assert graph_text(graph, 50).splitlines() == [
@@ -174,7 +88,7 @@ def test_a_list_is_broken_between_words() -> None:
     ]
 
 
-def test_a_terminal_without_these_characters_gets_others() -> None:
+def test_terminal_without_these_characters_gets_others() -> None:
     for width in (60, 120):
         assert graph_text(GRAPH, width, ascii_only=True).isascii()
     stream = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
@@ -182,29 +96,11 @@ def test_a_terminal_without_these_characters_gets_others() -> None:
     assert b"position + velocity" in stream.buffer.getvalue()  # type: ignore[attr-defined]  # a BytesIO, given above
 
 
-def test_an_empty_graph_is_drawn_as_nothing() -> None:
-    assert graph_text(Graph("none", (), ()), 80) == ""
-    ET.fromstring(graph_svg(Graph("none", (), ())))  # noqa: S314  our own text
-
-
-def test_a_running_robots_graph_shows_what_is_active_now() -> None:
-    common = {"type": "part", "held": False, "rate": 50.0, "joints": ["j"], "reference": [], "reads": []}
-    info = {
-        "rate": 100.0,
-        "joints": ["j"],
-        "controllers": [
-            {**common, "name": "up", "active": False, "command": ["position"], "into": ["low"]},
-            {
-                **common,
-                "name": "low",
-                "active": True,
-                "command": ["effort"],
-                "into": [],
-                "reference": ["position"],
-            },
-        ],
-    }
-    shown = drawing(info)
+def test_graph_of_a_running_robot_shows_what_is_active_now() -> None:
+    common = {"type": "part", "held": False, "rate": 50.0, "joints": ["j"], "reads": []}
+    up = {"name": "up", "active": False, "command": ["position"], "into": ["low"], "reference": []}
+    low = {"name": "low", "active": True, "command": ["effort"], "into": [], "reference": ["position"]}
+    shown = drawing({"rate": 100.0, "joints": ["j"], "controllers": [common | up, common | low]})
     assert [(node.name, node.active, node.about) for node in shown.nodes] == [
         ("up", False, "part, 50 Hz"),
         ("low", True, "part, 50 Hz"),
@@ -214,13 +110,12 @@ def test_a_running_robots_graph_shows_what_is_active_now() -> None:
 
 
 @settings(max_examples=50, deadline=None, suppress_health_check=[HealthCheck.too_slow])
-@given(st.lists(st.sets(st.integers(0, 6), max_size=3), min_size=1, max_size=7))
+@given(st.lists(st.sets(st.integers(0, 6), max_size=3), max_size=7))
 def test_any_graph_is_placed_with_each_edge_a_step_to_the_right(above: list[set[int]]) -> None:
     """Node i leads to some of those before it, so there is no circle."""
     nodes = tuple(Node(f"n{i}", "controller", (f"n{i}",), "out") for i in range(len(above)))
     edges = tuple(Edge(f"n{i}", f"n{j}") for i, ends in enumerate(above) for j in sorted(ends) if j < i)
     graph = Graph("any", nodes, edges)
-
     laid = placed(graph)
 
     column = {name: at for at, layer in enumerate(laid.layers) for name in layer}
@@ -241,12 +136,7 @@ def test_any_graph_is_placed_with_each_edge_a_step_to_the_right(above: list[set[
     ET.fromstring(graph_svg(graph))  # noqa: S314  our own text
 
 
-def test_what_is_read_of_the_same_joints_is_one_node(dxlrun: Dxlrun) -> None:
-    drawn = dxlrun("check", ROBOTS / "leader_follower.yaml", "--graph").out
-    assert "position + velocity + age ├" in drawn
-
-
-def test_lines_that_cross_are_told_from_lines_that_are_joined() -> None:
+def test_lines_that_cross_differ_from_lines_that_are_joined() -> None:
     nodes = [Node(name, "source", (name,), "x") for name in "abc"]
     nodes += [Node(name, "controller", (name,)) for name in "pqr"]
     edges = [Edge(start, end) for start, end in ("aq", "ar", "bp", "br", "cp", "cq")]
@@ -257,8 +147,3 @@ def test_lines_that_cross_are_told_from_lines_that_are_joined() -> None:
     assert graph_text(crossing, 80, ascii_only=True).isascii()
     straight = Graph("", tuple(nodes), (Edge("a", "p"), Edge("b", "p"), Edge("b", "q"), Edge("c", "r")))
     assert "╫" not in graph_text(straight, 80)
-
-
-def test_a_fallback_is_in_the_box(dxlrun: Dxlrun, chain: Path) -> None:
-    chain.write_text(CHAIN.replace("into: arm_pid}", "into: arm_pid, fallback: still}"))
-    assert "fallback: still" in dxlrun("check", chain, "--graph").out
