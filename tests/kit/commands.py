@@ -156,15 +156,15 @@ def _check(  # noqa: PLR0917
     assert said.code == int(code or 2 * bool(errors)), shown
     lines = iter(printed)
     for one in expected[">"]:
-        assert any(_matches(one, line) for line in lines), f"{one!r} is missing: {shown}"
+        assert any(matches(one, line) for line in lines), f"{one!r} is missing: {shown}"
     assert [one for one in expected["!"] if one in said.out + said.err] == [], shown
     assert len(told) == len(errors), shown
-    assert all(map(_matches, errors, told)), shown
+    assert all(map(matches, errors, told)), shown
     for word in stage.asked:
         if expected[word]:
             found = [_squeezed(one, here) for one in stage.asked[word]()]
             assert len(found) == len(expected[word]), (place, found)
-            assert all(map(_matches, expected[word], found)), (place, found)
+            assert all(map(matches, expected[word], found)), (place, found)
     if said.code == 2:
         assert sorted(here.rglob("*")) == before, f"{place}: something is written"
     if expected["json"]:
@@ -216,6 +216,7 @@ def _squeezed(line: str, here: Path | None = None) -> str:
     return re.sub(r"([ ─])\1+", r"\1", " ".join(line.split()))
 
 
-def _matches(pattern: str, line: str) -> bool:
+def matches(pattern: str, line: str) -> bool:
+    """Compare a line with one of a text, in which `...` stands for any words."""
     parts = _squeezed(pattern).split("...")
     return re.fullmatch(".*".join(map(re.escape, parts)), line) is not None
