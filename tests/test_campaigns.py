@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from tests.kit.nested import run_pytest
 
-ROOT = Path(__file__).parents[1]
 MADE_UP = """
 from hypothesis import given, settings, strategies as st
 from tests.kit.campaigns import campaign
@@ -47,45 +44,35 @@ def test_examples():
 """
 
 
-@pytest.fixture(name="run")
-def _run(tmp_path: Path):
-    path = tmp_path / "test_made_up.py"
-    path.write_text(MADE_UP)
-    (tmp_path / "conftest.py").write_text((ROOT / "tests/conftest.py").read_text())
-    config = ("-c", str(ROOT / "pyproject.toml"), f"--rootdir={tmp_path}", "-p", "no:cacheprovider")
-    inherited = {name: value for name, value in os.environ.items() if not name.startswith(("PYTEST", "COV_"))}
-    environment = inherited | {"PYTHONPATH": str(ROOT)}
-
-    def run(*options: str) -> str:
-        words = [sys.executable, "-m", "pytest", "-rP", "-n", "0", *config, *options, str(path)]
-        ran = subprocess.run(
-            words, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
-        )
-        assert ran.returncode == 0, ran.stdout + ran.stderr
-        return ran.stdout
-
-    return run
+def run(folder: Path, *options: str) -> str:
+    ran = run_pytest(folder, {"test_made_up.py": MADE_UP}, "-rP", "-n", "0", *options, "test_made_up.py")
+    assert ran.code == 0, ran.out
+    return ran.out
 
 
 @pytest.mark.parametrize(
     ("level", "passed", "amount", "examples"),
     [("ci", 6, 1.5, 10), ("night", 8, 2, 12), ("release", 9, 2, 14)],
 )
-def test_level_decides_the_counts(run, level: str, passed: int, amount: float, examples: int) -> None:
-    output = run(f"--campaign={level}")
+def test_level_decides_the_counts(
+    tmp_path: Path, level: str, passed: int, amount: float, examples: int
+) -> None:
+    output = run(tmp_path, f"--campaign={level}")
     assert f"{passed} passed" in output
     assert f"amount {amount}\n" in output
     assert f"examples {examples}\n" in output
 
 
-def test_seed_decides_what_is_drawn(run) -> None:
-    drawn = [re.findall(r"^drawn .*", run(*words), re.MULTILINE) for words in ((), (), ("--seed", "2"))]
+def test_seed_decides_what_is_drawn(tmp_path: Path) -> None:
+    drawn = [
+        re.findall(r"^drawn .*", run(tmp_path, *words), re.MULTILINE) for words in ((), (), ("--seed", "2"))
+    ]
     assert drawn[0] == drawn[1]
     assert len({*drawn[0], *drawn[2]}) == 6
 
 
-def test_table_has_every_campaign_and_runs_nothing(run) -> None:
-    output = run("--campaigns", "-n", "2")
+def test_table_has_every_campaign_and_runs_nothing(tmp_path: Path) -> None:
+    output = run(tmp_path, "--campaigns", "-n", "2")
     rows = re.findall(r"^ +(\S+) +(\S+) +(\S+)  \S+::test_(\w+)$", output, re.MULTILINE)
     assert rows == [
         ("1.5", "2", "2", "amount"),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import subprocess
 import sys
@@ -10,95 +9,69 @@ from pathlib import Path
 
 import pytest
 from tests.kit import selection, skips
+from tests.kit.nested import Ran, run_pytest
 
 ROOT = Path(__file__).parents[1]
 SHORT = "def test_short():\n    pass\n"
 LONG = "import pytest\npytestmark = pytest.mark.long\ndef test_long():\n    pass\n"
+FILES = {"test_short.py": SHORT, "test_long.py": LONG}
 
 
-@pytest.fixture(name="run")
-def _run(tmp_path: Path):
-    (tmp_path / "pyproject.toml").write_text('[tool.pytest.ini_options]\nmarkers = ["long", "campaign"]\n')
-    (tmp_path / "conftest.py").write_text((ROOT / "tests/conftest.py").read_text())
-    for name, text in (("test_short", SHORT), ("test_long", LONG)):
-        (tmp_path / f"{name}.py").write_text(text)
-    inherited = {name: value for name, value in os.environ.items() if not name.startswith(("PYTEST", "COV_"))}
-    environment = inherited | {"PYTHONPATH": str(ROOT)}
-
-    def run(*words: str, code: int = 0) -> list[str]:
-        command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *words]
-        ran = subprocess.run(
-            command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
-        )
-        assert ran.returncode == code, ran.stdout + ran.stderr
-        return ran.stdout.splitlines()
-
-    return run
+def run(folder: Path, *words: str, files: dict[str, str] = FILES) -> Ran:
+    return run_pytest(folder, files, *words)
 
 
 @pytest.mark.parametrize("workers", ["0", "2"])
-def test_whole_suite_leaves_out_long_tests_and_reports_it_last(run, workers: str) -> None:
-    *_, passed, last = run("-n", workers)
-    assert passed.startswith("1 passed")
-    assert last == "left out: 1 long tests that no given change needs (--all runs them)"
+def test_change_runs_its_long_tests_and_the_rest_is_left_out_and_reported_last(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, workers: str
+) -> None:
+    monkeypatch.setattr(selection, "affected_files", lambda paths: paths)
+    skipped = 'import pytest\ndef test_skip():\n    pytest.skip("it is Sunday")\n'
+    files = FILES | {"test_other.py": LONG, "test_skip.py": skipped, "changed.txt": "test_long.py\n"}
+    ran = run(tmp_path, "-n", workers, "--changed=changed.txt", "--strict-skips", files=files)
+    assert ran.code == 1
+    assert "not allowed to skip: test_skip.py::test_skip: Skipped: it is Sunday\n" in ran.out
+    assert "\n2 passed, 1 skipped" in ran.out
+    assert ran.last == "left out: 1 long tests that no given change needs (--all runs them)"
 
 
 def test_options_are_known_where_the_whole_suite_runs(tmp_path: Path) -> None:
     """Without paths, pytest finds tests/conftest.py below the root, unless another word is a path."""
     (tmp_path / "changed.txt").write_text("README.md\n")
-    options = (
-        f"--changed={tmp_path}/changed.txt",
-        "--strict-skips",
-        "--campaigns",
-        "-k",
-        "no_test_has_this_name",
-    )
+    options = (f"--changed={tmp_path}/changed.txt", "--strict-skips", "--campaigns", "--help")
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *options]
     ran = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert "unrecognized" not in ran.stderr
-    assert "release  test" in ran.stdout
+    assert (ran.returncode, "unrecognized" in ran.stderr) == (0, False), ran.stderr
+    assert "--strict-skips" in ran.stdout
 
 
 @pytest.mark.parametrize("words", [("--all",), ("test_long.py", "test_short.py"), (".",)])
-def test_all_and_named_paths_run_as_a_whole(run, words: tuple[str, ...]) -> None:
-    assert run("-n", "0", *words)[-1].startswith("2 passed")
-
-
-@pytest.mark.parametrize("workers", ["0", "2"])
-def test_changed_files_run_their_long_tests_in_every_process(run, tmp_path: Path, workers: str) -> None:
-    (tmp_path / "changed.txt").write_text("test_long.py\n")
-    conftest = (tmp_path / "conftest.py").read_text()
-    stub = "selection.affected_files = lambda paths: paths\n"
-    (tmp_path / "conftest.py").write_text(conftest + stub)
-    assert run("-n", workers, "--changed=changed.txt")[-1].startswith("2 passed")
+def test_all_and_named_paths_run_as_a_whole(tmp_path: Path, words: tuple[str, ...]) -> None:
+    assert run(tmp_path, "-n", "0", *words).last.startswith("2 passed")
 
 
 @pytest.mark.parametrize(
     ("words", "reason", "code"),
     [
-        ((), "moto[server,s3]", 0),
-        (("--all",), "moto[server,s3]", 1),
-        (("--all",), "no IPv6", 0),
-        ((), "it is Sunday", 1),
+        ((), "it is Sunday", 0),
+        (("--strict-skips",), "moto[server,s3]", 0),
+        (("--strict-skips", "--all"), "moto[server,s3]", 1),
+        (("--strict-skips", "--all"), "no IPv6", 0),
     ],
 )
-def test_other_skip_than_those_allowed_fails_the_run(
-    run, tmp_path: Path, words: tuple[str, ...], reason: str, code: int
+def test_skips_are_counted_where_they_are_strict(
+    tmp_path: Path, words: tuple[str, ...], reason: str, code: int
 ) -> None:
-    (tmp_path / "test_short.py").write_text(f"import pytest\ndef test_skip():\n    pytest.skip({reason!r})\n")
-    for workers in ("0", "2"):
-        run("-n", workers)
-        lines = run("-n", workers, "--strict-skips", *words, code=code)
-        assert any("not allowed to skip: test_short.py::test_skip" in line for line in lines) == bool(code)
+    files = {"test_skip.py": f"import pytest\ndef test_skip():\n    pytest.skip({reason!r})\n"}
+    ran = run(tmp_path, "-n", "0", *words, files=files)
+    assert (ran.code, "not allowed to skip: test_skip.py::test_skip" in ran.out) == (code, bool(code))
 
 
-@pytest.mark.parametrize("pattern", [*skips.ALLOWED, *skips.ALLOWED_BUT_FOR_ALL])
-def test_allowed_skip_is_one_of_the_tests(pattern: str) -> None:
-    source = "".join(
-        path.read_text("utf-8") for path in ROOT.glob("tests/**/*.py") if path.name != "skips.py"
-    )
+def test_each_allowed_skip_is_one_of_the_tests() -> None:
+    paths = [path for path in ROOT.glob("tests/**/*.py") if path.name != "skips.py"]
+    source = "".join(path.read_text("utf-8") for path in paths)
     marked = " ".join(f"needs dxlrun[{extra}]" for extra in re.findall(r"mark\.needs\(\"(\w+)\"\)", source))
-    assert re.search(pattern, f"{source} {marked}")
+    assert [one for one in (*skips.ALLOWED, *skips.ALLOWED_BUT_FOR_ALL) if not re.search(one, f"{source} {marked}")] == []
 
 
 @pytest.mark.parametrize(

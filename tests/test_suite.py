@@ -17,29 +17,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.kit.loaded import loaded
+from tests.kit.nested import run_pytest
 
 ROOT = Path(__file__).parents[1]
 SHIPPED = ("docs", "plugins", "release", "robots", "runtime", "tests")
 
 
-def run(*words: str, directory: Path = ROOT) -> subprocess.CompletedProcess[str]:
+def run(*words: str) -> subprocess.CompletedProcess[str]:
     """Run this interpreter without the options of the tests' own run."""
     environment = {key: value for key, value in os.environ.items() if not key.startswith(("PYTEST", "COV_"))}
-    environment |= {"PYTHONPATH": str(ROOT)}
-    return subprocess.run(
-        [sys.executable, *words], cwd=directory, env=environment, capture_output=True, text=True, check=False
-    )
-
-
-def pytest_on(
-    source: str, directory: Path, *options: str, conftest: str = ""
-) -> subprocess.CompletedProcess[str]:
-    """Run pytest on one test file, with the settings of this suite."""
-    path = directory / "test_made_up.py"
-    path.write_text(source)
-    config = ("-c", str(ROOT / "pyproject.toml"), f"--rootdir={directory}", "-p", "no:cacheprovider")
-    (directory / "conftest.py").write_text(conftest or (ROOT / "tests/conftest.py").read_text())
-    return run("-m", "pytest", "-q", *config, *options, str(path), directory=directory)
+    words = (sys.executable, *words)
+    return subprocess.run(words, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
 
 
 def test_every_test_has_a_limit(pytestconfig: pytest.Config) -> None:
@@ -144,16 +132,16 @@ exec(code)
 
 def test_only_an_own_import_or_a_mark_skips_what_lacks_an_extra(tmp_path: Path) -> None:
     """A failure stays one, whatever it says: of a module that a command lacks, too."""
-    (tmp_path / "test_import.py").write_text("import not_there\n")
     tests = [f"def test_{name}():\n    {body}\n" for name, body in (SKIPS | FAILURES).items()]
     marked = "def test_marked", '@pytest.mark.needs("table")\ndef test_marked'
     source = "\n".join([CALLED, *tests]).replace(*marked)
     conftest = (ROOT / "tests/conftest.py").read_text()
     table = re.sub(r"(EXTRAS: .*?= )\{.*?\n\}", r'\1{"table": ("not_there",)}', conftest, flags=re.DOTALL)
-    ran = pytest_on(source, tmp_path, str(tmp_path), "-n", "0", conftest=table)
-    assert f"{len(FAILURES)} failed, {len(SKIPS) + 1} skipped" in ran.stdout, ran.stdout
-    assert "not run: import, made_up needs dxlrun[table]\n" in ran.stdout
-    failed = re.findall(r"^FAILED .*::test_(\w+)", ran.stdout, re.MULTILINE)
+    files = {"test_import.py": "import not_there\n", "test_made_up.py": source, "conftest.py": table}
+    ran = run_pytest(tmp_path, files, "-n", "0", "-rfE")
+    assert f"{len(FAILURES)} failed, {len(SKIPS) + 1} skipped" in ran.out, ran.out
+    assert "not run: import, made_up needs dxlrun[table]\n" in ran.out
+    failed = re.findall(r"^FAILED .*::test_(\w+)", ran.out, re.MULTILINE)
     assert sorted(failed) == sorted(FAILURES)
 
 
@@ -173,10 +161,18 @@ def test_a_property_draws_the_same_examples_again() -> None:
     assert drawn[0] == drawn[1]
 
 
-def test_the_sdist_has_every_file_of_its_folders(tmp_path: Path) -> None:
-    built = run("-m", "hatchling", "build", "--target", "sdist", "--directory", str(tmp_path))
-    assert built.returncode == 0, built.stdout + built.stderr
-    (archive,) = tmp_path.glob("*.tar.gz")
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the sdist and the wheel."""
+    folder = tmp_path_factory.mktemp("built")
+    words = ("hatchling", "build", "--target", "sdist", "--target", "wheel", "--directory", str(folder))
+    ran = run("-m", *words)
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+    return folder
+
+
+def test_sdist_has_every_file_of_its_folders(built: Path) -> None:
+    (archive,) = built.glob("*.tar.gz")
     with tarfile.open(archive) as tar:
         packed = {name.partition("/")[2] for name in tar.getnames()}
     found = (path for folder in SHIPPED for path in (ROOT / folder).rglob("*") if path.is_file())
@@ -204,11 +200,9 @@ def test_each_fragment_of_the_changelog_is_one_that_towncrier_takes() -> None:
     assert config["start_string"] in (ROOT / config["filename"]).read_text()
 
 
-def test_the_wheel_has_every_robot_and_motion(tmp_path: Path) -> None:
+def test_wheel_has_every_robot_and_motion(built: Path) -> None:
     """For `dxlrun examples`; the top level of the repository stays their only source."""
-    built = run("-m", "hatchling", "build", "--target", "wheel", "--directory", str(tmp_path))
-    assert built.returncode == 0, built.stdout + built.stderr
-    (wheel,) = tmp_path.glob("*.whl")
+    (wheel,) = built.glob("*.whl")
     with zipfile.ZipFile(wheel) as archive:
         names = [name for name in archive.namelist() if name.startswith("dxlrun/examples/")]
         shipped = {Path(name).relative_to("dxlrun/examples"): archive.read(name) for name in names}

@@ -159,7 +159,10 @@ def test_terminal_gets_a_table_the_commands_and_a_verdict(dxlrun: Dxlrun, made: 
 def test_configuration_of_the_running_kernel_may_be_compressed(made: Made) -> None:
     made.write(DYNAMIC)
     packed = made.root / "proc/config.gz"
-    for content, named in ((gzip.compress(b"CONFIG_PREEMPT_NONE=y\nCONFIG_PREEMPT_DYNAMIC=y\n"), 1), (b"\x1f\x8b", 0)):
+    for content, named in (
+        (gzip.compress(b"CONFIG_PREEMPT_NONE=y\nCONFIG_PREEMPT_DYNAMIC=y\n"), 1),
+        (b"\x1f\x8b", 0),
+    ):
         packed.write_bytes(content)
         assert [one.what for one in diagnose(made.machine)].count("preemption") == named
 

@@ -65,7 +65,9 @@ class Robot:
     @staticmethod
     def _script(into: dict[int, list[GoalState | BaseException]], line: str) -> None:
         number, controller, origin, words = re.fullmatch(r"(\d+) of (\w+)(?: by (.+))?: (.+)", line).groups()  # type: ignore[union-attr]
-        into[int(number)] = [state(int(number), controller, origin or "anna", word) for word in words.split(", ")]
+        into[int(number)] = [
+            state(int(number), controller, origin or "anna", word) for word in words.split(", ")
+        ]
 
     def refuse(self, line: str) -> None:
         what, _, rest = line.partition(" ")
@@ -81,7 +83,9 @@ class Robot:
             raise KeyboardInterrupt
         return Executed(7, tuple(RemoteGoal(self, number) for number in numbers))  # type: ignore[arg-type]
 
-    def send(self, controller: str, kind: str, command: Any, *, seconds: float | None = None, **_: Any) -> Executed:
+    def send(
+        self, controller: str, kind: str, command: Any, *, seconds: float | None = None, **_: Any
+    ) -> Executed:
         self.requests.append(f"send {controller} {kind} {command} {seconds}")
         return self._executed(*[3] * self.goals_begin)
 
@@ -96,7 +100,8 @@ class Robot:
     def info(self) -> dict[str, Any]:
         motions = {"pages": {"walk": 2.0, "bow": 1.25}}
         controllers = [
-            {"name": name, "joints": moved, "motions": motions.get(name, {})} for name, moved in JOINTS.items()
+            {"name": name, "joints": moved, "motions": motions.get(name, {})}
+            for name, moved in JOINTS.items()
         ]
         return {"file": str(self.file), "groups": {}, "controllers": controllers}
 
@@ -167,7 +172,9 @@ def test_list_has_what_can_be_played_with_its_length(dxlrun: Dxlrun, robot: Robo
     wave = f"name: wave\nmotions:\n- controller: arm\n  start: 1 s\n  {points}\n"
     (reader / "wave.yaml").write_text(wave)
     (reader / "broken.yaml").write_text("name: broken\nmotions: 3\n")
-    (reader / "flap.yaml").write_text(wave.replace("controller: arm", "controller: wing"))  # for another robot
+    (reader / "flap.yaml").write_text(
+        wave.replace("controller: arm", "controller: wing")
+    )  # for another robot
     found = result_of(dxlrun("play", "--list", "--json").out)
     assert [(each["motion"], each["joints"], each["seconds"]) for each in found] == [
         ("bow", ["hip"], 1.25),

@@ -35,7 +35,9 @@ def test_picture_of_a_robot_has_all_in_it_and_nothing_over_another(
     dxlrun: Dxlrun, tmp_path: Path, name: str
 ) -> None:
     path = tmp_path / "graph.svg"
-    assert f"the controller graph is in {path}" in dxlrun("check", ROBOTS / f"{name}.yaml", "--graph", path).out
+    assert (
+        f"the controller graph is in {path}" in dxlrun("check", ROBOTS / f"{name}.yaml", "--graph", path).out
+    )
     root = ET.parse(path).getroot()  # noqa: S314  our own file
     space = "{http://www.w3.org/2000/svg}"
     controllers = result_of(dxlrun("check", ROBOTS / f"{name}.yaml", "--json").out)["controllers"]

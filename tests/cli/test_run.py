@@ -124,7 +124,10 @@ def totals(group: EventGroup) -> EventTotals:
         (
             {"events": totals(LIMP)},
             1,
-            ["failed: head_pitch_joint went limp at 0.1 s; ran for 2.0 s.", "head_pitch_joint: torque is off."],
+            [
+                "failed: head_pitch_joint went limp at 0.1 s; ran for 2.0 s.",
+                "head_pitch_joint: torque is off.",
+            ],
         ),
         (
             {"events": totals(TAKEOVER)},
@@ -152,7 +155,11 @@ def totals(group: EventGroup) -> EventTotals:
         ({"run_load": BUSY, "skipped": 2, "invalid": VALID}, 0, ["ran for 2.0 s.", f"  {MACHINE}"]),
         ({"skipped": 3, "simulation_wait": SimulationWait(210_000_000, 3)}, 0, ["ran for 2.", f"  {WAITED}"]),
         ({"run_load": BUSY, "events": totals(LOST), "invalid": VALID}, 1, ["head was lost", f"  {MACHINE}"]),
-        ({"run_load": BUSY, "events": totals(FAULT), "invalid": VALID}, 1, ["ran for 2.0 s.", "head: head: nan."]),
+        (
+            {"run_load": BUSY, "events": totals(FAULT), "invalid": VALID},
+            1,
+            ["ran for 2.0 s.", "head: head: nan."],
+        ),
     ],
 )
 def test_counts_and_events_of_a_run_make_its_verdict(
@@ -172,9 +179,17 @@ def test_counts_and_events_of_a_run_make_its_verdict(
 @pytest.mark.parametrize(
     ("answer", "out", "errors"),
     [
-        (replace(GOOD, exit_code=1, reason="fault", sentences=("servo 3 does not answer",)), "failed: ", None),
+        (
+            replace(GOOD, exit_code=1, reason="fault", sentences=("servo 3 does not answer",)),
+            "failed: ",
+            None,
+        ),
         (replace(GOOD, exit_code=130, sentences=("servo 3 does not answer",)), "interrupted: ", None),
-        (replace(SILENT, log="logs/torso.mcap", messages=9), "failed: the loop never ran a cycle.\nlog: ", None),
+        (
+            replace(SILENT, log="logs/torso.mcap", messages=9),
+            "failed: the loop never ran a cycle.\nlog: ",
+            None,
+        ),
         (replace(SILENT, start_up_load=BUSY, refused_for_replies=True), "failed: ", [MACHINE]),
         (replace(SILENT, start_up_load=BUSY), "failed: ", []),  # a plug-in that cannot be imported
         (replace(GOOD, exit_code=1, remarks=("no real-time priority",)), "", ["no real-time priority"]),
@@ -191,7 +206,9 @@ def test_bad_run_prints_the_reason_on_stderr(
     assert "next: " not in said.out
 
 
-def test_real_servos_of_a_busy_machine_are_not_to_be_simulated(dxlrun: Dxlrun, runs: Runs, torso: Path) -> None:
+def test_real_servos_of_a_busy_machine_are_not_to_be_simulated(
+    dxlrun: Dxlrun, runs: Runs, torso: Path
+) -> None:
     runs.answer = replace(GOOD, run_load=BUSY)
     assert dxlrun(torso, "port:=/dev/ttyUSB0").out.splitlines()[1].endswith(" s. End other programs.")
 
@@ -281,7 +298,9 @@ def test_run_with_a_loss_in_its_log_has_failed_for_the_terminal_and_for_analyze(
     assert verdict["sentences"][0] in Path("run.html").read_text()
 
 
-def test_loss_without_a_log_is_reported_and_fails_the_run(dxlrun: Dxlrun, torso: Path, meanwhile: Meanwhile) -> None:
+def test_loss_without_a_log_is_reported_and_fails_the_run(
+    dxlrun: Dxlrun, torso: Path, meanwhile: Meanwhile
+) -> None:
     meanwhile(1.0, lambda robot: robot.buses[0].servos[1].silence(True))
     printed = [dxlrun(torso, "--virtual", "--duration", "2", *words) for words in ((), ("--no-record",))]
     assert [said.code for said in printed] == [1, 1]
@@ -312,7 +331,9 @@ def test_motion_decides_when_a_run_ends_and_fails_it_when_it_is_cut(
     said = dxlrun(*words, three_parts, "--duration", "1.5")
     assert said.code == 1
     assert said.out.startswith("bioloid_torso: failed: ran for 1.5 s; 0 of ")
-    assert re.search(r"by its duration at 1\.5 s, before three.* s; omit --duration\.$", said.out, re.MULTILINE)
+    assert re.search(
+        r"by its duration at 1\.5 s, before three.* s; omit --duration\.$", said.out, re.MULTILINE
+    )
     assert any("but the run ends at 1.5 s; omit --duration" in line for line in said.errors)
 
 

@@ -89,7 +89,9 @@ def _cases(name: str) -> Iterator[Any]:
         if line:
             block.append((number, line))
         elif block:
-            marks = [pytest.mark.needs(extra) for start, extra in NEEDED.items() if block[0][1].startswith(start)]
+            marks = [
+                pytest.mark.needs(extra) for start, extra in NEEDED.items() if block[0][1].startswith(start)
+            ]
             yield pytest.param(Case(name, files, block), id=block[0][1], marks=marks)
             block = []
 
@@ -141,7 +143,9 @@ def _check(  # noqa: PLR0917
 ) -> tuple[Said, list[str]]:
     command, _, code = line.partition(" => ")
     words = [stage.names.get(word, word) for word in shlex.split(command)]
-    expected: dict[str, list[str]] = {">": [], "!": [], "json": [], "": []} | {word: [] for word in stage.asked}
+    expected: dict[str, list[str]] = {">": [], "!": [], "json": [], "": []} | {
+        word: [] for word in stage.asked
+    }
     for each in below:
         kind = each.partition(" ")[0]
         kind = kind if kind in expected else ""
@@ -185,7 +189,12 @@ def _check_json(place: str, words: list[str], said: Said, dxlrun: Dxlrun) -> Non
         return
     for_programs = dxlrun(*words, "--json")
     refusal = read_answer(for_programs.out)
-    assert (for_programs.code, for_programs.err, refusal.ok, refusal.result) == (said.code, "", False, None), place
+    assert (for_programs.code, for_programs.err, refusal.ok, refusal.result) == (
+        said.code,
+        "",
+        False,
+        None,
+    ), place
     sentences = ["; ".join(filter(None, (one.what, one.fix))) for one in refusal.errors]
     errors = [line for line in said.errors if ": warning: " not in line]
     assert (len(sentences), len(refusal.warnings)) == (len(errors), len(said.errors) - len(errors)), place
