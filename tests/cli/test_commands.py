@@ -1,4 +1,4 @@
-"""Command lines and what they print: the cases of texts in this folder; `tests/kit/commands.py` has their form."""
+"""Command lines and what they print: texts in this folder; `tests/kit/commands.py` has their form."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Runs at the terminal: what a run is asked for, its verdict and sentences, its log, its progress, its signals."""
+"""Runs at the terminal: what a run is asked for, its verdict, its log, its progress, its signals."""
 
 from __future__ import annotations
 
@@ -94,8 +94,8 @@ def test_options_reach_plan_and_run(dxlrun: Dxlrun, runs: Runs, torso: Path, thr
 BUSY = MachineLoad(6.0, busy_s=5.2, no_idle_core_s=5.2)
 MACHINE = "The machine was too busy: no core was idle in 5.2 of 6 s. End other programs, or use --virtual."
 WAITED = (
-    "The machine was too busy: the loop waited 3 times, 210 ms in all, for the process of the simulated servos. "
-    "End other programs, or use --virtual."
+    "The machine was too busy: the loop waited 3 times, 210 ms in all, for the process of the simulated "
+    "servos. End other programs, or use --virtual."
 )
 SILENT = RunSummary(1, "start-up", 0, 0, 0.1, ("servo 3 does not answer",))
 FAULT = EventGroup(EventCode.CONTROLLER_FAULT, Severity.ERROR, "head", 1, 5_100_000_000, "head: nan")
@@ -163,7 +163,7 @@ def totals(group: EventGroup) -> EventTotals:
     ],
 )
 def test_counts_and_events_of_a_run_make_its_verdict(
-    dxlrun: Dxlrun, runs: Runs, torso: Path, changed: dict[str, Any], code: int, shown: list[str]
+    *, dxlrun: Dxlrun, runs: Runs, torso: Path, changed: dict[str, Any], code: int, shown: list[str]
 ) -> None:
     runs.answer = replace(GOOD, **{"skipped": 0, **changed})
     said = dxlrun(torso)
@@ -196,7 +196,7 @@ def test_counts_and_events_of_a_run_make_its_verdict(
     ],
 )
 def test_bad_run_prints_the_reason_on_stderr(
-    dxlrun: Dxlrun, runs: Runs, torso: Path, answer: RunSummary, out: str, errors: list[str] | None
+    *, dxlrun: Dxlrun, runs: Runs, torso: Path, answer: RunSummary, out: str, errors: list[str] | None
 ) -> None:
     runs.answer = answer
     said = dxlrun(torso)

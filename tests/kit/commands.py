@@ -1,17 +1,18 @@
 """Commands run in this process, and texts of what they print.
 
-A text in `tests/cli` has files behind `---- NAME` lines up to `====`, and then cases with a blank line between them:
+A text in `tests/cli` has files behind lines `---- NAME` up to `====`, and then cases with blank lines between:
 
     check arm.yaml --online => 1
       > arm: good. ... 2 warnings
       ! Traceback
+      json joints[0].id = 7
       warning: ID 3 has another model; ...
 
 A line at the margin is a command and, behind `=>`, its exit code; without one that is 2 where errors are given,
-else 0. Below it stand, each in the order of the output: lines of the output (`>`), words that are nowhere in what
-it prints (`!`), values of its answer with --json (`json joints[0].id = 7`), and all lines of the errors without
-`dxlrun: `. `...` stands for any words, and the number of spaces does not count. `robots` lies in the working
-directory, whose path is cut from what is printed. A refused command writes nothing, and says the same with --json.
+else 0. Below it are lines of the output (`>`, in its order), words that are nowhere in what it prints (`!`),
+values of its answer with --json, and then all lines of the errors, without `dxlrun: `. `...` stands for any
+words, and the number of spaces does not count. `robots` is in the working directory, whose path is cut from
+what is printed. A refused command writes nothing, and says the same with --json.
 
 A stage adds lines of its own to a text: what is given before a command, and what is asked after it.
 """
@@ -34,7 +35,7 @@ from dxlrun.cli.app import build
 
 ROOT = Path(__file__).parents[2]
 TEXTS = ROOT / "tests" / "cli"
-NEEDED = {"identify": "identify", "analyze LOG --report": "report"}
+NEEDED = {"identify": "identify"}
 """Beginnings of commands that need an extra."""
 
 
@@ -107,7 +108,7 @@ class Stage:
         self.names: dict[str, str] = {}
         """Words of commands, and what stands for them"""
 
-    def place(self, case: Case) -> Path:
+    def place(self, case: Case) -> None:
         """Write the files of a case into the working directory."""
         here = Path.cwd()
         if not (here / "robots").exists():
@@ -115,13 +116,12 @@ class Stage:
         for name, text in case.files.items():
             (here / name).parent.mkdir(parents=True, exist_ok=True)
             (here / name).write_text(text)
-        return here
 
 
 def play(case: Case, dxlrun: Dxlrun, stage: Stage | None = None) -> None:
     """Run the commands of a case and compare what they print."""
-    bare, stage = stage is None, stage or Stage()
-    here = stage.place(case)
+    played = _Play(dxlrun, stage or Stage(), Path.cwd())
+    played.stage.place(case)
     steps: list[tuple[int, str, list[str]]] = []
     for number, line in case.lines:
         if line.startswith("  "):
@@ -130,75 +130,77 @@ def play(case: Case, dxlrun: Dxlrun, stage: Stage | None = None) -> None:
             steps.append((number, line, []))
     for number, line, below in steps:
         word, _, rest = line.partition(" ")
-        if word in stage.given:
-            stage.given[word](rest)
+        if word in played.stage.given:
+            played.stage.given[word](rest)
         else:
-            said, words = _check(f"{case.text}:{number}", line, below, dxlrun, stage, here)
-            if "--json" not in words and (said.code == 2 or (bare and said.err and not said.out)):
-                _check_json(f"{case.text}:{number}", words, said, dxlrun)
+            place = f"{case.text}:{number}"
+            said, words = played.check(place, line, below)
+            if "--json" not in words and (said.code == 2 or (stage is None and said.err and not said.out)):
+                played.check_json(place, words, said)
 
 
-def _check(  # noqa: PLR0917
-    place: str, line: str, below: list[str], dxlrun: Dxlrun, stage: Stage, here: Path
-) -> tuple[Said, list[str]]:
-    command, _, code = line.partition(" => ")
-    words = [stage.names.get(word, word) for word in shlex.split(command)]
-    expected: dict[str, list[str]] = {">": [], "!": [], "json": [], "": []} | {
-        word: [] for word in stage.asked
-    }
-    for each in below:
-        kind = each.partition(" ")[0]
-        kind = kind if kind in expected else ""
-        expected[kind].append(each.removeprefix(kind).strip())
-    errors = expected[""]
-    before = sorted(here.rglob("*"))
-    said = dxlrun(*words)
-    printed = [_squeezed(one, here) for one in said.out.splitlines()]
-    told = [_squeezed(one.removeprefix("dxlrun: "), here) for one in said.errors]
-    shown = f"{place}: {said.code}\n{said.out}{said.err}"
+class _Play(NamedTuple):
+    """Commands with a stage in a working directory."""
 
-    assert said.code == int(code or 2 * bool(errors)), shown
-    lines = iter(printed)
-    for one in expected[">"]:
-        assert any(matches(one, line) for line in lines), f"{one!r} is missing: {shown}"
-    assert [one for one in expected["!"] if one in said.out + said.err] == [], shown
-    assert len(told) == len(errors), shown
-    assert all(map(matches, errors, told)), shown
-    for word in stage.asked:
-        if expected[word]:
-            found = [_squeezed(one, here) for one in stage.asked[word]()]
-            assert len(found) == len(expected[word]), (place, found)
-            assert all(map(matches, expected[word], found)), (place, found)
-    if said.code == 2:
-        assert sorted(here.rglob("*")) == before, f"{place}: something is written"
-    if expected["json"]:
-        out = said.out if "--json" in words else dxlrun(*words, "--json").out
-        answer = read_answer(out)
-        for one in expected["json"]:
-            path, _, value = one.partition(" = ")
-            found = _item(answer.result, path)
-            wanted = json.loads(value)
-            wanted = pytest.approx(wanted) if isinstance(wanted, float) else wanted
-            assert found == wanted, f"{place}: {path} is {json.dumps(found)}"
-    return said, words
+    dxlrun: Dxlrun
+    stage: Stage
+    here: Path
 
+    def check(self, place: str, line: str, below: list[str]) -> tuple[Said, list[str]]:
+        """Run a command and compare it with the lines below it."""
+        command, _, code = line.partition(" => ")
+        words = [self.stage.names.get(word, word) for word in shlex.split(command)]
+        expected: dict[str, list[str]] = {one: [] for one in (">", "!", "json", "", *self.stage.asked)}
+        for each in below:
+            kind = each.partition(" ")[0]
+            kind = kind if kind in expected else ""
+            expected[kind].append(each.removeprefix(kind).strip())
+        before = sorted(self.here.rglob("*"))
+        said = self.dxlrun(*words)
+        shown = f"{place}: {said.code}\n{said.out}{said.err}"
 
-def _check_json(place: str, words: list[str], said: Said, dxlrun: Dxlrun) -> None:
-    """Compare a refusal with the one that programs get."""
-    if not _has_json(tuple(words[:2])):
-        return
-    for_programs = dxlrun(*words, "--json")
-    refusal = read_answer(for_programs.out)
-    assert (for_programs.code, for_programs.err, refusal.ok, refusal.result) == (
-        said.code,
-        "",
-        False,
-        None,
-    ), place
-    sentences = ["; ".join(filter(None, (one.what, one.fix))) for one in refusal.errors]
-    errors = [line for line in said.errors if ": warning: " not in line]
-    assert (len(sentences), len(refusal.warnings)) == (len(errors), len(said.errors) - len(errors)), place
-    assert all(line.endswith(one) for line, one in zip(errors, sentences, strict=True)), place
+        assert said.code == int(code or 2 * bool(expected[""])), shown
+        lines = iter([self.squeezed(one) for one in said.out.splitlines()])
+        for one in expected[">"]:
+            assert any(matches(one, line) for line in lines), f"{one!r} is missing: {shown}"
+        assert [one for one in expected["!"] if one in said.out + said.err] == [], shown
+        self.compare(expected[""], [one.removeprefix("dxlrun: ") for one in said.errors], shown)
+        for word, ask in self.stage.asked.items():
+            if expected[word]:
+                self.compare(expected[word], ask(), place)
+        if said.code == 2:
+            assert sorted(self.here.rglob("*")) == before, f"{place}: something is written"
+        if expected["json"]:
+            answer = read_answer(said.out if "--json" in words else self.dxlrun(*words, "--json").out)
+            for one in expected["json"]:
+                path, _, value = one.partition(" = ")
+                found, wanted = _item(answer.result, path), json.loads(value)
+                wanted = pytest.approx(wanted) if isinstance(wanted, float) else wanted
+                assert found == wanted, f"{place}: {path} is {json.dumps(found)}"
+        return said, words
+
+    def compare(self, expected: Sequence[str], found: Sequence[str], shown: str) -> None:
+        """Compare lines with all those that a text has."""
+        found = [self.squeezed(one) for one in found]
+        assert len(found) == len(expected), (shown, found)
+        assert all(map(matches, expected, found)), (shown, found)
+
+    def check_json(self, place: str, words: list[str], said: Said) -> None:
+        """Compare a refusal with the one that programs get."""
+        if not _has_json(tuple(words[:2])):
+            return
+        code, out, err = self.dxlrun(*words, "--json")
+        refusal = read_answer(out)
+        assert (code, err, refusal.ok, refusal.result) == (said.code, "", False, None), place
+        sentences = ["; ".join(filter(None, (one.what, one.fix))) for one in refusal.errors]
+        errors = [line for line in said.errors if ": warning: " not in line]
+        counts = len(sentences), len(refusal.warnings)
+        assert counts == (len(errors), len(said.errors) - len(errors)), place
+        assert all(line.endswith(one) for line, one in zip(errors, sentences, strict=True)), place
+
+    def squeezed(self, line: str) -> str:
+        """Return a line with single spaces, without the working directory."""
+        return _squeezed(line.replace(f"{self.here}/", ""))
 
 
 @functools.cache
@@ -219,9 +221,8 @@ def _item(found: Any, path: str) -> Any:
     return found
 
 
-def _squeezed(line: str, here: Path | None = None) -> str:
-    """Return a line with single spaces and single pieces of drawn lines, and without the working directory."""
-    line = line.replace(f"{here}/", "") if here else line
+def _squeezed(line: str) -> str:
+    """Return a line with single spaces, and one piece of each drawn line."""
     return re.sub(r"([ ─])\1+", r"\1", " ".join(line.split()))
 
 
