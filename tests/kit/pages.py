@@ -2,12 +2,26 @@
 
 from __future__ import annotations
 
+import re
+import shlex
 from pathlib import Path
 
-DOCS = Path(__file__).parents[2] / "docs"
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
 PATHS = {path.name: path for path in sorted(DOCS.rglob("*.md")) if path.parent.name != "changes"}
 
 
 def page_text(name: str) -> str:
     """Return the text of a page."""
     return PATHS[name].read_text()
+
+
+def page_commands(name: str) -> list[list[str]]:
+    """Return the words of each command that a page shows in a line of its own, without `dxlrun`."""
+    lines = re.findall(r"^    dxlrun (.+)$", page_text(name), re.MULTILINE)
+    return [shlex.split(line.partition("  #")[0]) for line in lines]
+
+
+def page_blocks(name: str, language: str) -> list[str]:
+    """Return the blocks of a language on a page."""
+    return re.findall(rf"^```{language}\n(.*?)^```$", page_text(name), re.MULTILINE | re.DOTALL)
