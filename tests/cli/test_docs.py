@@ -40,7 +40,9 @@ TESTS = {
     "README.md": ("tests/test_readme.py",),
     "add-a-section.md": ("plugins/lights/tests/test_lights.py",),
     **dict.fromkeys(("analyze.md", "architecture.md", "bus.md", "devices.md", "frames.md"), (HERE,)),
-    **dict.fromkeys(("mechanics.md", "models.md", "simulation.md", "tools.md", "from-ros2-control.md"), (HERE,)),
+    **dict.fromkeys(
+        ("mechanics.md", "models.md", "simulation.md", "tools.md", "from-ros2-control.md"), (HERE,)
+    ),
     **dict.fromkeys(("raspberry-pi.md", "real-time.md"), (HERE, "tests/cli/test_latency.py")),
     **dict.fromkeys(("arm.md", "controller.md", "humanoid.md"), ("tests/cli/test_tutorial.py",)),
     "bench.md": ("tests/bench/test_bench_page.py", "tests/cli/test_docs.py"),
@@ -69,7 +71,9 @@ TESTS = {
 
 
 def test_every_page_with_commands_has_a_test_that_runs_them() -> None:
-    assert {page for page, text in PAGES.items() if re.search(r"^    dxlrun ", text, re.MULTILINE)} == set(TESTS)
+    assert {page for page, text in PAGES.items() if re.search(r"^    dxlrun ", text, re.MULTILINE)} == set(
+        TESTS
+    )
     for page, paths in TESTS.items():
         for path in paths:
             assert page in (ROOT / path).read_text(), (page, path)
@@ -235,7 +239,9 @@ def test_it_does_not_work_md_quotes_messages_of_the_program() -> None:
     symptoms = re.split(r"^### ", page, flags=re.MULTILINE)[1:]
     assert len(symptoms) >= 25
     assert [text.partition("\n")[0] for text in symptoms if "`dxlrun " not in text] == []
-    written = "\n".join(text for path, text in SOURCES.items() if path.relative_to(ROOT).parts[0] == "runtime")
+    written = "\n".join(
+        text for path, text in SOURCES.items() if path.relative_to(ROOT).parts[0] == "runtime"
+    )
     written = re.sub(r'" *\n\s+f?"', "", written)  # a sentence in several lines
     for quoted in re.findall(r"^> (.+)$", page, re.MULTILINE):
         if quoted != "dxlrun: command not found":  # the shell's

@@ -89,7 +89,10 @@ def test_analyze_md(dxlrun: Dxlrun, reader: Path) -> None:
     lines = page_commands("analyze.md")
     assert len(lines) == 4
     for words in lines:
-        typed(dxlrun, [one for word in words for one in {"LOG": logs[:1], "logs/*.mcap": logs}.get(word, [word])])
+        typed(
+            dxlrun,
+            [one for word in words for one in {"LOG": logs[:1], "logs/*.mcap": logs}.get(word, [word])],
+        )
     assert (reader / "run.html").exists()
 
 
@@ -114,7 +117,9 @@ def test_mechanics_md(dxlrun: Dxlrun, reader: Path) -> None:
     assert re.search(r"hip: \{position: -?0\.\d+ rad, velocity: -?\d\.\d+ rad/s\}", written)
 
 
-def test_bus_md(dxlrun: Dxlrun, reader: Path, served: list[BusConfig], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bus_md(
+    dxlrun: Dxlrun, reader: Path, served: list[BusConfig], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The simulation and the robot as processes: tests/cli/test_sim.py; the fault: tests/run/test_unplugs.py."""
     ftdi, simulate, run = page_commands("bus.md")
     refused = dxlrun(*ftdi)

@@ -1,29 +1,49 @@
-"""`dxlrun scan`: its words, and a pseudo-terminal with simulated servos, judged by the ledger."""
+"""`dxlrun scan`: a pseudo-terminal with simulated servos, judged by the ledger."""
+
+from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import yaml
 from tests.kit.answers import result_of
+from tests.kit.commands import Dxlrun
 
 from dxlrun.log.log_reader import read_log
 from dxlsim.simulation_plan import BusConfig, ServoConfig
 from dxlwire.packets import PacketKind
 
-
-def servos(*models):
-    return tuple(ServoConfig(number + 1, model, 2.0) for number, model in enumerate(models))
-
-
 NARROW = ("--baud", "1000000", "--ids", "1-4")
+HOLD = """
+import sys
+from dxlwire.port.serial_open import open_serial
+port = open_serial(sys.argv[1], 57_600)
+print("open", flush=True)
+sys.stdin.read()
+"""
+Line = Callable[[BusConfig], tuple[str, Callable[[], Any]]]
 
 
-def test_the_servos_are_a_table_and_a_robot_file_that_check_accepts(dxlrun, simulated_line, tmp_path):
-    path, finish = simulated_line(BusConfig("main", 1_000_000, servos("XM430-W350", "XL430-W250"), 2.0))
-    robot = tmp_path / "arm.yaml"
-    said = dxlrun("scan", path, "--protocol", "2.0", *NARROW, "--output", robot)
+def bus(*models: str) -> BusConfig:
+    servos = tuple(ServoConfig(number, model, 2.0) for number, model in enumerate(models, 1))
+    return BusConfig("main", 1_000_000, servos, 1.0 if "AX-12A" in models else 2.0)
+
+
+def heard(finish: Callable[[], Any]) -> list[bytes]:
+    return [entry.data for entry in finish() if entry.direction == "in"]
+
+
+def test_servos_are_a_table_a_log_and_a_robot_file_that_check_accepts(
+    dxlrun: Dxlrun, simulated_line: Line, tmp_path: Path
+) -> None:
+    path, finish = simulated_line(bus("XM430-W350", "XL430-W250"))
+    robot, log = tmp_path / "arm.yaml", tmp_path / "scan.mcap"
+    said = dxlrun("scan", path, "--protocol", "2.0", *NARROW, "--output", robot, "--log", log)
     assert (said.code, said.err) == (0, "")
-    head, _, first, second, written = said.out.splitlines()
+    head, _, first, second, written, *_ = said.out.splitlines()
     assert head.split()[:2] == ["ID", "model"]
     assert first.split()[:2] == ["1", "XM430-W350"]
     assert second.split()[:6] == ["2", "XL430-W250", "1060", "45", "2.0", "1000000"]
@@ -32,63 +52,47 @@ def test_the_servos_are_a_table_and_a_robot_file_that_check_accepts(dxlrun, simu
     assert dxlrun("check", robot).code == 0
     online = dxlrun("check", robot, "--online", "--json")
     assert online.code == 0, online.out
-    assert {entry.data[7] for entry in finish() if entry.direction == "in"} == {1, 2}
 
-
-def test_both_protocols_are_looked_at_and_told_as_json(dxlrun, simulated_line):
-    path, finish = simulated_line(BusConfig("main", 1_000_000, servos("AX-12A")))
-    said = dxlrun("scan", path, *NARROW, "--json")
-    assert said.code == 0
-    result = result_of(said.out)
-    assert result["port"] == path
-    (servo,) = result["servos"]
-    assert (servo["model"], servo["protocol"], servo["baud_rate"]) == ("AX-12A", 1.0, 1_000_000)
-    heard = b"".join(entry.data for entry in finish() if entry.direction == "in")
-    packets = heard.split(b"\xff\xff")[1:]  # not by entry: a bus that stood still hears two at once
-    assert {data[2] for data in packets if data[0] != 0xFD} == {1, 2}
-    assert sum(data[0] == 0xFD for data in packets) >= 4
-
-
-def test_no_servo_at_all_is_exit_code_one(dxlrun, simulated_line):
-    path, _ = simulated_line(BusConfig("main", 1_000_000, (), 2.0))
-    said = dxlrun("scan", path, *NARROW)
-    assert said.code == 1
-    assert f"no servo answers at {path}" in said.err
-
-
-HOLD = """
-import sys
-from dxlwire.port.serial_open import open_serial
-port = open_serial(sys.argv[1], 57_600)
-print("open", flush=True)
-sys.stdin.read()
-"""
-
-
-def test_a_port_in_use_is_not_touched_and_its_process_is_named(dxlrun, simulated_line):
-    path, finish = simulated_line(BusConfig("main", 1_000_000, servos("XM430-W350"), 2.0))
-    command = [sys.executable, "-c", HOLD, path]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
-        assert other.stdout.readline() == "open\n"
-        said = dxlrun("scan", path, *NARROW)
-        other.stdin.close()
-    assert said.code == 1
-    assert f"{path} is in use by" in said.err
-    assert f"(process {other.pid})" in said.err
-    assert [entry for entry in finish() if entry.direction == "in"] == []
-
-
-def test_the_packets_of_a_scan_are_a_log_when_it_is_named(dxlrun, simulated_line, tmp_path):
-    path, finish = simulated_line(BusConfig("main", 1_000_000, servos("XM430-W350"), 2.0))
-    log = tmp_path / "scan.mcap"
-    assert dxlrun("scan", path, "--protocol", "2.0", *NARROW, "--log", log).code == 0
-
+    sent = heard(finish)
+    assert {data[7] for data in sent} == {1, 2}, "pings and reads"
     read = read_log(log)
-    sent = b"".join(one.data for one in read.packets if one.kind == PacketKind.INSTRUCTION)
-    assert sent == b"".join(entry.data for entry in finish() if entry.direction == "in")
-    assert set(read.packets.cycle.tolist()) == {-1}
-    assert read.complete
+    packets = b"".join(one.data for one in read.packets if one.kind == PacketKind.INSTRUCTION)
+    assert len(packets) > 100
+    assert b"".join(sent).startswith(packets)
+    assert (set(read.packets.cycle.tolist()), read.complete) == ({-1}, True)
     assert "runtime" in read.metadata["identity"]
     said = dxlrun("analyze", log)
     assert (said.code, said.err) == (0, "")
     assert f"traffic of `dxlrun scan {path}`, not a run: {len(read.packets)} packets" in said.out
+
+
+def test_both_protocols_are_looked_at_and_reported_as_json(dxlrun: Dxlrun, simulated_line: Line) -> None:
+    path, finish = simulated_line(bus("AX-12A"))
+    said = dxlrun("scan", path, *NARROW, "--json")
+    result = result_of(said.out)
+    assert (said.code, result["port"]) == (0, path)
+    (servo,) = result["servos"]
+    assert (servo["model"], servo["protocol"], servo["baud_rate"]) == ("AX-12A", 1.0, 1_000_000)
+    packets = b"".join(heard(finish)).split(b"\xff\xff")[1:]  # not by entry: a delayed bus hears two at once
+    assert {data[2] for data in packets if data[0] != 0xFD} == {1, 2}
+    assert sum(data[0] == 0xFD for data in packets) >= 4
+
+
+def test_no_servo_at_all_is_exit_code_one(dxlrun: Dxlrun, simulated_line: Line) -> None:
+    path, _ = simulated_line(bus())
+    said = dxlrun("scan", path, *NARROW)
+    assert (said.code, f"no servo answers at {path}" in said.err) == (1, True)
+
+
+def test_port_in_use_is_not_touched_and_its_process_is_named(dxlrun: Dxlrun, simulated_line: Line) -> None:
+    path, finish = simulated_line(bus("XM430-W350"))
+    command = [sys.executable, "-c", HOLD, path]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
+        assert other.stdout
+        assert other.stdout.readline() == "open\n"
+        said = dxlrun("scan", path, *NARROW)
+        other.communicate()
+    assert said.code == 1
+    assert f"{path} is in use by" in said.err
+    assert f"(process {other.pid})" in said.err
+    assert heard(finish) == []
