@@ -38,7 +38,16 @@ def test_help_names_every_command_and_option(dxlrun: Dxlrun) -> None:
     assert said.code == 0
     usage = "Usage: dxlrun ROBOT.yaml [ARG:=VALUE ...] [OPTIONS]\n       dxlrun COMMAND ...\n"
     assert said.out.startswith(usage)
-    for word in "check analyze --play --duration --no-record --take-over --virtual --debug".split():
+    for word in [
+        "check",
+        "analyze",
+        "--play",
+        "--duration",
+        "--no-record",
+        "--take-over",
+        "--virtual",
+        "--debug",
+    ]:
         assert word in said.out
 
 

@@ -120,7 +120,7 @@ def test_mechanics_md(dxlrun: Dxlrun, reader: Path) -> None:
 def test_bus_md(
     dxlrun: Dxlrun, reader: Path, served: list[BusConfig], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The simulation and the robot as processes: tests/cli/test_sim.py; the fault: tests/run/test_unplugs.py."""
+    """As processes: tests/cli/test_sim.py; the fault, too: tests/run/test_unplugs.py."""
     ftdi, simulate, run = page_commands("bus.md")
     refused = dxlrun(*ftdi)
     (highest,) = re.findall(r"highest rate that is left, (\d+ Hz)", page_text("bus.md"))

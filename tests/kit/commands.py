@@ -1,6 +1,6 @@
 """Commands run in this process, and texts of what they print.
 
-A text in `tests/cli` has files behind lines `---- NAME` up to `====`, and then cases with blank lines between:
+A text in `tests/cli` has files behind lines `---- NAME` up to `====`, and then cases:
 
     check arm.yaml --online => 1
       > arm: good. ... 2 warnings
@@ -8,11 +8,11 @@ A text in `tests/cli` has files behind lines `---- NAME` up to `====`, and then 
       json joints[0].id = 7
       warning: ID 3 has another model; ...
 
-A line at the margin is a command and, behind `=>`, its exit code; without one that is 2 where errors are given,
-else 0. Below it are lines of the output (`>`, in its order), words that are nowhere in what it prints (`!`),
+A line at the margin is a command with its exit code; without one that is 2 where errors are given, else 0.
+Below a command are lines of the output (`>`, in its order), words that are nowhere in what it prints (`!`),
 values of its answer with --json, and then all lines of the errors, without `dxlrun: `. `...` stands for any
-words, and the number of spaces does not count. `robots` is in the working directory, whose path is cut from
-what is printed. A refused command writes nothing, and says the same with --json.
+words, the number of spaces does not count, and a blank line ends a case. `robots` is in the working directory,
+whose path is cut from what is printed. A refused command writes nothing, and says the same with --json.
 
 A stage adds lines of its own to a text: what is given before a command, and what is asked after it.
 """
