@@ -71,7 +71,11 @@ def test_each_allowed_skip_is_one_of_the_tests() -> None:
     paths = [path for path in ROOT.glob("tests/**/*.py") if path.name != "skips.py"]
     source = "".join(path.read_text("utf-8") for path in paths)
     marked = " ".join(f"needs dxlrun[{extra}]" for extra in re.findall(r"mark\.needs\(\"(\w+)\"\)", source))
-    assert [one for one in (*skips.ALLOWED, *skips.ALLOWED_BUT_FOR_ALL) if not re.search(one, f"{source} {marked}")] == []
+    assert [
+        one
+        for one in (*skips.ALLOWED, *skips.ALLOWED_BUT_FOR_ALL)
+        if not re.search(one, f"{source} {marked}")
+    ] == []
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ A text in `tests/cli` has files behind lines `---- NAME` up to `====`, and then 
 A line at the margin is a command with its exit code; without one that is 2 where errors are given, else 0.
 Below a command are lines of the output (`>`, in its order), words that are nowhere in what it prints (`!`),
 values of its answer with --json, and then all lines of the errors, without `dxlrun: `. `...` stands for any
-words, the number of spaces does not count, and a blank line ends a case. `robots` is in the working directory,
+words; spaces are not counted, and a blank line ends a case. `robots` is in the working directory,
 whose path is cut from what is printed. A refused command writes nothing, and says the same with --json.
 
 A stage adds lines of its own to a text: what is given before a command, and what is asked after it.
