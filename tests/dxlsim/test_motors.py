@@ -7,8 +7,8 @@ simplest (M1: Coulomb and viscous friction) and the fullest (M6). The simulation
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
-import msgspec
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -29,7 +29,7 @@ START = 1.0
 """rad"""
 
 
-class Identified(msgspec.Struct, frozen=True):
+class Identified(NamedTuple):
     """A model of bam/params: base, and load times |torque|; more of both (`slow`) below `speed`."""
 
     kt: float
@@ -49,42 +49,30 @@ class Identified(msgspec.Struct, frozen=True):
         return held + self.viscous * abs(velocity)
 
 
-class Bench(msgspec.Struct, frozen=True):
+class Bench(NamedTuple):
     """A servo as BAM had it on its bench, bam/dynamixel/actuator.py, and as it is simulated here."""
 
     protocol: float
     voltage: float
-    stiffness: float
-    """Duty per rad at the P gain that the servo is shipped with"""
+    stiffness: float  # Duty per rad at the P gain that the servo is shipped with
     most_duty: float
-    steps: tuple[int, ...]
-    """degrees; an XL-320 does not come to 90 % of a smaller one"""
-    slow: dict[str, int]
-    """A speed of about 0.06 rad/s"""
-    rests: tuple[float, float]
-    """degrees of error in which it comes to rest without load"""
+    steps: tuple[int, ...]  # degrees; an XL-320 does not come to 90 % of a smaller one
+    slow: tuple[str, int]  # A speed of about 0.06 rad/s
+    rests: tuple[float, float]  # degrees of error in which it comes to rest without load
+    gain: str  # The item of the P gain
+    constant_s: float = 0.0  # J R / kt^2 of M1
 
 
-MX = {
-    "protocol": 1.0,
-    "voltage": 15.0,
-    "stiffness": 32 * 0.158,
-    "most_duty": 0.9625,
-    "slow": {"moving_speed": 5},
-}
+STEPS, XL330 = (10, 30, 60, 90), 400 * 4096 / math.tau / 256 / 885
 BENCH = {
-    "MX-64": Bench(**MX, steps=(10, 30, 60, 90), rests=(0.15, 0.19)),
-    "MX-106": Bench(**MX, steps=(10, 30, 60, 90), rests=(0.08, 0.13)),
-    "XL330-M288": Bench(
-        2.0,
-        7.5,
-        400 * 4096 / math.tau / 256 / 885,
-        1.0,
-        (10, 30, 60, 90),
-        {"profile_velocity": 3},
-        (0.5, 0.75),
+    "MX-64": Bench(1.0, 15.0, 32 * 0.158, 0.9625, STEPS, ("moving_speed", 5), (0.15, 0.19), "p_gain", 0.0179),
+    "MX-106": Bench(
+        1.0, 15.0, 32 * 0.158, 0.9625, STEPS, ("moving_speed", 5), (0.08, 0.13), "p_gain", 0.0164
     ),
-    "XL-320": Bench(2.0, 7.5, 32 * 0.05048199, 1.0, (60, 90), {"moving_speed": 5}, (2.0, 5.0)),
+    "XL330-M288": Bench(
+        2.0, 7.5, XL330, 1.0, STEPS, ("profile_velocity", 3), (0.5, 0.75), "position_p_gain", 0.0487
+    ),
+    "XL-320": Bench(2.0, 7.5, 32 * 0.05048199, 1.0, (60, 90), ("moving_speed", 5), (2.0, 5.0), "p_gain"),
 }
 M1 = {
     "MX-64": Identified(1.622467, 3.949434, 0.01195124, 0.09038677, 0.01169160),
@@ -93,29 +81,14 @@ M1 = {
     "XL-320": Identified(0.9869471, 35.60910, 0.001118951, 0.02751450, 0.003317608),
 }
 # of the fullest model's terms those of the load's torque are left out, as there is none here
-M6 = {
-    "MX-64": Identified(
-        1.601683, 2.316404, 0.01226589, 0.0, 0.02533701, 0.3114720, 0.1226953, 0.1877438, 2.575277, 0.8409018
-    ),
-    "MX-106": Identified(
-        2.209828, 2.033662, 0.02601618, 0.0, 0.05071567, 0.1980055, 0.1219541, 0.1985997, 1.746325, 1.142828
-    ),
-    "XL330-M288": Identified(
-        0.3660135,
-        2.811392,
-        0.001807743,
-        0.004771183,
-        0.005359668,
-        0.2667861,
-        0.004676346,
-        0.0,
-        2.890372,
-        8.68326,
-    ),
-    "XL-320": Identified(
-        1.008827, 31.58588, 0.001162986, 0.0, 0.007225172, 0.0, 0.01630551, 0.0, 2.301054, 1.706736
-    ),
+M6_ROWS = {
+    "MX-64": "1.601683 2.316404 0.01226589 0 0.02533701 0.3114720 0.1226953 0.1877438 2.575277 0.8409018",
+    "MX-106": "2.209828 2.033662 0.02601618 0 0.05071567 0.1980055 0.1219541 0.1985997 1.746325 1.142828",
+    "XL330-M288": "0.3660135 2.811392 0.001807743 0.004771183 0.005359668 0.2667861 0.004676346 0 2.890372 "
+    "8.68326",
+    "XL-320": "1.008827 31.58588 0.001162986 0 0.007225172 0 0.01630551 0 2.301054 1.706736",
 }
+M6 = {model: Identified(*map(float, row.split())) for model, row in M6_ROWS.items()}
 both = pytest.mark.parametrize("parameters", [M1, M6], ids=["M1", "M6"])
 four = pytest.mark.parametrize("model", BENCH)
 
@@ -187,17 +160,8 @@ def test_a_servo_with_a_motor_file_is_that_motor(model, parameters):
     """As BAM's own equations of its parameters; its two small servos stick more near standstill."""
     known, bench = parameters[model], BENCH[model]
     stribeck = Stribeck(known.slow_base, known.speed, known.alpha) if known.slow_base else None
-    motor = MotorModel(
-        model,
-        bench.voltage,
-        known.kt,
-        known.resistance,
-        known.armature,
-        known.base,
-        known.load,
-        known.viscous,
-        stribeck,
-    )
+    electric = known.kt, known.resistance, known.armature
+    motor = MotorModel(model, bench.voltage, *electric, known.base, known.load, known.viscous, stribeck)
     expected = reference(known, bench, math.radians(60), 1.0)[9::10]
 
     def off(motor: MotorModel | None) -> tuple[float, float]:
@@ -228,46 +192,31 @@ def test_top_speeds_are_within_10_percent_of_the_identified_servo(model, paramet
 @pytest.mark.parametrize("direction", [1, -1])
 def test_it_comes_to_rest_as_far_from_its_goal_as_real_ones_do(model, direction):
     servo, mechanics = simulated(model)
-    for name, value in BENCH[model].slow.items():
-        servo.poke(name, value)
+    servo.poke(*BENCH[model].slow)
     angles, goal = move(servo, mechanics, START + direction * 0.2, 6.0)
     assert angles[-1] == angles[-10]
     low, high = BENCH[model].rests
     assert low <= math.degrees(goal - angles[-1]) * direction <= high
 
 
-# J R / kt^2 of M1; in M3 a part l of the torque goes into friction: 1 / (1 - l) of its J R / kt^2 compares
-@pytest.mark.parametrize(
-    ("model", "constant_s"),
-    [("MX-64", 0.0179), ("MX-106", 0.0164), ("XL330-M288", 0.0487)],
-)
-def test_time_constants_are_those_that_were_identified(model, constant_s):
-    parameters = M1[model]
-    assert parameters.armature * parameters.resistance / parameters.kt**2 == pytest.approx(
-        constant_s, abs=1e-4
-    )
-    motor = motor_of(find_table(model, BENCH[model].protocol))
-    assert motor.time_constant / (1 - motor.load_friction) == pytest.approx(constant_s, rel=0.1)
-
-
-@pytest.mark.parametrize(
-    ("model", "protocol", "item", "stiffness"),
-    [
-        ("MX-64", 1.0, "p_gain", 5.06),
-        ("MX-106", 1.0, "p_gain", 5.06),
-        ("XL330-M288", 2.0, "position_p_gain", 1.15),
-        ("XL-320", 2.0, "p_gain", 1.6),
-    ],
-)
-def test_the_output_for_a_rad_of_error_is_that_which_was_identified(model, protocol, item, stiffness):
+@four
+def test_time_constant_and_gain_are_those_that_were_identified(model):
+    parameters, bench = M1[model], BENCH[model]
+    table = find_table(model, bench.protocol)
+    if bench.constant_s:
+        constant_s = parameters.armature * parameters.resistance / parameters.kt**2
+        assert constant_s == pytest.approx(bench.constant_s, abs=1e-4)
+        motor = motor_of(table)
+        # in M3 a part l of the torque goes into friction: 1 / (1 - l) of its J R / kt^2 compares
+        assert motor.time_constant / (1 - motor.load_friction) == pytest.approx(constant_s, rel=0.1)
     servo, mechanics = simulated(model)
-    error = 0.02  # rad; less than friction holds, or caught before it moves
-    unit = servo.registers.table.rad_per_tick
-    servo.poke("goal_position", round((START + error) / unit))
+    # an error of 0.02 rad: less than friction holds, or caught before it moves
+    goal = round((START + 0.02) / table.rad_per_tick)
+    servo.poke("goal_position", goal)
     mechanics.step_to(STEP_NS)
-    duty = float(mechanics.law.duty[0]) / (round((START + error) / unit) * unit - START)
-    assert duty == pytest.approx(stiffness, rel=0.01)
-    assert servo.registers[item] == find_table(model, protocol).items[item].initial
+    duty = float(mechanics.law.duty[0]) / (goal * table.rad_per_tick - START)
+    assert duty == pytest.approx(bench.stiffness, rel=0.02)
+    assert servo.registers[bench.gain] == table.items[bench.gain].initial
 
 
 def test_models_that_nothing_was_published_of_keep_the_manual_s_figures_marked_so():

@@ -78,5 +78,4 @@ def test_it_arrives_exactly_and_then_costs_nothing():
     run(profiles, 1.0)
     profiles.check_arrival()
     assert profiles.arrived
-    assert profiles.position[0] == 0.1 + 0.2
-    assert profiles.velocity[0] == 0.0
+    assert (profiles.position[0], profiles.velocity[0]) == (0.1 + 0.2, 0.0)

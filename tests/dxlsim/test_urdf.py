@@ -10,20 +10,9 @@ import pytest
 from dxlsim.geometry.urdf import Mimic, UrdfLimits, leader, read_urdf
 from dxlwire.exceptions import InputError
 
-ARM = """\
-<robot name="arm">
-  <link name="base"/><link name="upper"/><link name="finger"/><link name="thumb"/>
-  <joint name="elbow" type="revolute">
-    <parent link="base"/><child link="upper"/>
-    <origin xyz="1 2 3" rpy="0.1 0.2 0.3"/><axis xyz="0 3 4"/>
-    <limit lower="-1" upper="2" velocity="3" effort="4"/>
-  </joint>
-  <joint name="thumb_slide" type="prismatic">
-    <parent link="upper"/><child link="thumb"/><mimic joint="finger_slide" multiplier="-2" offset="0.5"/>
-  </joint>
-  <joint name="finger_slide" type="prismatic"><parent link="upper"/><child link="finger"/></joint>
-</robot>
-"""
+TEXT = Path(__file__).with_name("urdf_mistakes.txt").read_text("utf-8")
+ARM, *_ = TEXT.partition("\n")[2].split("====\n")
+CASES = TEXT.split("====\n")[1].strip().split("\n\n")
 
 
 def test_everything_is_read() -> None:
@@ -52,89 +41,22 @@ def test_each_joint_stands_behind_the_one_above_it() -> None:
     assert urdf.links == tuple(f"l{number}" for number in range(2999, -1, -1))
 
 
-TWO_ROOTS = "2 links have no parent: base, lonely; connect all links to one tree, for example by fixed joints"
-CIRCLE = "links form a circle: upper -> thumb -> upper; remove one joint of this circle"
-
-
-@pytest.mark.parametrize(
-    ("right", "wrong", "place", "expected"),
-    [
-        ('<link name="upper"/>', "<link/>", (2, 22), 'a link has no name; write <link name="...">'),
-        ('name="thumb"', 'name="upper"', (2, 63), "link upper is defined twice; rename one of the links"),
-        ('"thumb_slide" type', '"elbow" type', (8, 3), "joint elbow is defined twice; rename one"),
-        (' name="elbow"', "", (3, 3), 'a joint has no name; write <joint name="..." type="...">'),
-        (
-            "revolute",
-            "hinge",
-            (3, 3),
-            "joint elbow has the unknown type hinge; write one of revolute, continuous",
-        ),
-        ("revolute", "floating", (3, 3), "joint elbow is floating, with several degrees of freedom"),
-        ("revolute", "planar", (3, 3), "joint elbow is planar, with several degrees of freedom"),
-        (
-            '<parent link="base"/>',
-            "",
-            (3, 3),
-            'joint elbow has no parent; add <parent link="..."/>',
-        ),
-        (
-            'link="base"',
-            'link="bas"',
-            (4, 5),
-            "link bas, the parent of joint elbow, is not defined; did you mean base?",
-        ),
-        ('xyz="0 3 4"', 'xyz="0 0 0"', (5, 44), "the axis of joint elbow has zero length; write"),
-        ('xyz="1 2 3"', 'xyz="1 2"', (5, 5), "xyz of the origin of joint elbow is '1 2', not three"),
-        ('rpy="0.1', 'rpy="nan', (5, 5), "rpy of the origin of joint elbow is 'nan 0.2 0.3', not"),
-        ('lower="-1"', 'lower="low"', (6, 5), "lower of the limit of joint elbow is 'low', not a number"),
-        ('lower="-1"', 'lower="5"', (6, 5), "the lower limit of joint elbow, 5, is above the upper limit"),
-        (
-            'joint="finger_slide"',
-            "",
-            (9, 48),
-            'the mimic of joint thumb_slide names no joint; write <mimic joint="..."/>',
-        ),
-        (
-            'joint="finger_slide"',
-            'joint="finger_slid"',
-            (8, 3),
-            "joint thumb_slide mimics the unknown joint finger_slid; did you mean finger_slide?",
-        ),
-        (
-            'joint="finger_slide"',
-            'joint="thumb_slide"',
-            (8, 3),
-            "joint thumb_slide mimics itself: thumb_slide -> thumb_slide; remove one mimic of this circle",
-        ),
-        (
-            '<joint name="finger_slide" type="prismatic">',
-            '<joint name="finger_slide" type="fixed">',
-            (8, 3),
-            "joint thumb_slide mimics the fixed joint finger_slide; name a moving joint",
-        ),
-        ('<link name="thumb"/>', '<link name="thumb"/><link name="lonely"/>', (2, 83), TWO_ROOTS),
-        ('link="base"/><child', 'link="thumb"/><child', (3, 3), CIRCLE),
-        (
-            '<child link="finger"/>',
-            '<child link="thumb"/>',
-            (11, 3),
-            "link thumb is the child of two joints, thumb_slide and finger_slide; change one child",
-        ),
-        ("robot", "model", (1, 1), "the top element is model, not robot; name a URDF file"),
-        (ARM, "<robot/>", (1, 1), "the URDF has no links; add at least one link"),
-    ],
-)
-def test_a_mistake_is_named_at_its_place(
-    right: str, wrong: str, place: tuple[int, int], expected: str
-) -> None:
+@pytest.mark.parametrize("case", CASES)
+def test_a_mistake_is_named_at_its_place(case: str) -> None:
+    change, told = case.split("\n  ")
+    right, _, wrong = change.partition(" => ")
     assert right in ARM
     with pytest.raises(InputError) as caught:
         read_urdf(ARM.replace(right, wrong), "arm.urdf")
+    problems = caught.value.problems
+    said = [f"{one.mark.line}:{one.mark.column}: {one.what}; {one.fix}" for one in problems]
+    assert any(sentence.startswith(told) for sentence in said), said
+    assert problems[0].mark.file == "arm.urdf"
 
-    found = [f"{problem.what}; {problem.fix}" for problem in caught.value.problems]
-    assert any(sentence.startswith(expected) for sentence in found), found
-    marks = [problem.mark for problem in caught.value.problems]
-    assert (marks[0].file, marks[0].line, marks[0].column) == ("arm.urdf", *place)
+
+def test_a_urdf_without_links_is_named() -> None:
+    with pytest.raises(InputError, match="the URDF has no links; add at least one link"):
+        read_urdf("<robot/>")
 
 
 def test_all_mistakes_are_named_at_once() -> None:

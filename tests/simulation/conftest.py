@@ -9,23 +9,14 @@ import subprocess
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 import pytest
 from tests.kit.awaited import DEADLINE_S
 from tests.kit.bus_process import bare
-from tests.kit.simulated_line import Line2, build_line
 
 from dxlsim.bus.ledger import LedgerEntry, read_ledger
 from dxlsim.simulation_plan import BusConfig
-
-
-@pytest.fixture
-def make_line2() -> Callable[..., Line2]:
-    def make(ids: tuple[int, ...] = (1, 2), model: str = "XM430-W350", **settings: Any) -> Line2:
-        return build_line(Line2, 2.0, ids, model, **settings)
-
-    return make
 
 
 @dataclass

@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any, Literal
 
 import pytest
 import serial
 from tests.kit.bodies import Turned, bodies_of
 from tests.kit.packets import packet2
+from tests.kit.simulated_line import Line
 
 from dxlrun_mujoco.mujoco_plant import mujoco_plant
-from dxlsim.bus.simulated_bus import SimulatedBus
 from dxlsim.motion.mechanics import Mechanics
 from dxlsim.motion.motor import motor_of
 from dxlsim.simulation_plan import BusConfig, Load, ServoConfig, SimulationConfig
-from dxlsim.virtual_ports import VirtualPorts
 from dxlwire.control_table import find_table
 
 TICK = math.tau / 4096
@@ -28,9 +25,6 @@ STALL = 4.1
 START = 2048
 """Ticks; there the arm is horizontal."""
 
-Physics = Literal["independent", "mujoco"]
-Hang = Callable[[Physics], Any]
-
 URDF = f"""<robot name="arm"><link name="base"/>
 <link name="arm"><inertial><origin xyz="{ARM} 0 0"/><mass value="{MASS}"/>
 <inertia ixx="1e-9" iyy="1e-9" izz="1e-9" ixy="0" ixz="0" iyz="0"/></inertial></link>
@@ -39,24 +33,13 @@ URDF = f"""<robot name="arm"><link name="base"/>
 """About +y: the arm sinks as its angle grows; the servo, which is mounted the other way round, turns back."""
 
 
-@pytest.fixture
-def hang(make_line2: Callable[..., Any]) -> Hang:
-    """Return a bus with one XM430-W350 that holds an arm, limp and horizontal at the start."""
-
-    def hang(physics: Physics) -> Any:
-        if physics == "mujoco":
-            bodies = bodies_of(URDF, (Turned("shoulder", START * TICK, -1),))
-            mechanics, load = Mechanics(0, mujoco_plant(bodies)), Load()
-        else:
-            mechanics = Mechanics(0)
-            load = Load(inertia=MASS * ARM**2, gravity=PULL, gravity_angle=START * TICK - math.pi / 2)
-        line = make_line2((1,))
-        servo = ServoConfig(1, "XM430-W350", START * TICK, load=load)
-        line.bus = SimulatedBus(BusConfig("main", 1_000_000, (servo,), 2.0), line.ledger, 0, mechanics)
-        line.ports = VirtualPorts(line.clock, (line.bus,))
-        return line
-
-    return hang
+def hang(physics: str) -> Line:
+    """Return a line with one XM430-W350 that holds an arm, limp and horizontal at the start."""
+    if physics == "mujoco":
+        mechanics = Mechanics(0, mujoco_plant(bodies_of(URDF, (Turned("shoulder", START * TICK, -1),))))
+        return Line("XM430-W350", 1, position=START * TICK, mechanics=mechanics)
+    load = Load(inertia=MASS * ARM**2, gravity=PULL, gravity_angle=START * TICK - math.pi / 2)
+    return Line("XM430-W350", 1, position=START * TICK, load=load)
 
 
 def rubbing(torque: float, pull: float) -> float:
@@ -71,7 +54,7 @@ both = pytest.mark.parametrize("physics", ["independent", by_mujoco])
 
 @both
 @pytest.mark.parametrize("gain", [400, 800, 1600])
-def test_an_arm_sags_by_the_torque_that_the_p_gain_gives(hang, physics, gain):
+def test_an_arm_sags_by_the_torque_that_the_p_gain_gives(physics, gain):
     line = hang(physics)
     line.put(position_p_gain=gain, torque_enable=1, goal_position=START)
     line.wait(3)
@@ -82,7 +65,7 @@ def test_an_arm_sags_by_the_torque_that_the_p_gain_gives(hang, physics, gain):
 
 
 @both
-def test_a_limp_arm_falls_and_swings(hang, physics):
+def test_a_limp_arm_falls_and_swings(physics):
     line = hang(physics)
     line.set("torque_enable", 0)
     lowest = 0
@@ -97,7 +80,7 @@ def test_a_limp_arm_falls_and_swings(hang, physics):
 
 
 @pytest.mark.needs("physics")
-def test_both_ways_of_moving_show_the_host_the_same(hang):
+def test_both_ways_of_moving_show_the_host_the_same():
     lines = [hang("independent"), hang("mujoco")]
     for line in lines:
         line.put(torque_enable=1, profile_velocity=60, goal_position=START + 600)
