@@ -21,7 +21,7 @@ from dxlwire import dialect_of
 
 README = Path(dxlwire.__file__).with_name("README.md")
 OWN = Path(__file__).parent
-KIT = OWN.parent / "kit/plans.py"
+KIT = [OWN.parent / f"kit/{name}.py" for name in ("exchanges", "plans")]
 
 
 @pytest.fixture
@@ -81,7 +81,7 @@ print(sorted(name for name in sys.modules if name.split(".")[0] in ("dxlrun", "d
 
 def test_tests_of_dxlwire_need_neither_runtime_nor_simulation() -> None:
     found: dict[str, set[str]] = {}
-    for path in (*OWN.rglob("*.py"), KIT):
+    for path in (*OWN.rglob("*.py"), *KIT):
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.Import):
                 names = {one.name for one in node.names}
@@ -91,4 +91,4 @@ def test_tests_of_dxlwire_need_neither_runtime_nor_simulation() -> None:
     own = {name for names in found.values() for name in names if name.split(".")[0] in ("dxlrun", "dxlsim")}
     assert own == set()
     kit = {name for names in found.values() for name in names if name.startswith("tests.")}
-    assert kit == {"tests.kit.awaited", "tests.kit.plans"}
+    assert kit == {"tests.kit.awaited", "tests.kit.exchanges", "tests.kit.plans"}

@@ -1,0 +1,181 @@
+"""The exchange of dxlwire alone, on virtual time and on a pseudo-terminal in real time, back to back."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+import tty
+
+import pytest
+from tests.kit.exchanges import IDS, MODELS, GoodReplies, Host, SpoiltReplies
+from tests.kit.plans import ScriptedLine, make_plan
+
+from dxlwire.clock import MonotonicClock
+from dxlwire.exchange.bus_engine import Lines
+from dxlwire.packets import PacketKind
+from dxlwire.plan.line import Line
+from dxlwire.port.ports import SerialPort, SerialPorts
+from dxlwire.transaction import TransactionOutcome
+from dxlwire.wire import protocol1, protocol2
+
+
+class Reading:
+    """A job: reads one after the other; keeps each status and how each read ended."""
+
+    def __init__(self, reads):
+        self.reads, self.number = list(reads), -1
+        self.found, self.outcomes, self.strays = {}, [], 0
+
+    def next_transaction(self, reply):
+        if reply is not None:
+            self.outcomes.append(reply.outcome)
+            self.strays += reply.strays
+        self.number += 1
+        return self.reads[self.number] if self.number < len(self.reads) else None
+
+    def status(self, index, reply):
+        servo_id = self.reads[self.number].awaited[index].servo_id
+        self.found[servo_id] = (reply.error, bytes(reply.parameters), reply.last_ns)
+
+
+class Sink:
+    def __init__(self):
+        self.packets = []
+
+    def packet(self, _, kind, servo_id, first_ns, last_ns, data):
+        self.packets.append((kind, bytes(data), last_ns))
+
+
+class EngineHost(Host):
+    """A scripted line on virtual time."""
+
+    latency_ns = 0
+
+    def __init__(self, way):
+        protocol = 1.0 if MODELS[way] in ("AX-12A", "MX-28") else 2.0
+        self.dialect = protocol1 if protocol == 1.0 else protocol2
+        line, fast = Line(1_000_000, self.latency_ns, 0, self.dialect), way.startswith("fast")
+        entries = [(servo_id, *((36, 6) if protocol == 1.0 else (126, 10))) for servo_id in IDS]
+        singles = way == "single reads"
+        self._reads = (
+            [line.read_range(*one) for one in entries] if singles else [line.read_many(entries, fast=fast)]
+        )
+        self.sink = Sink()
+        ports, clock = self.open()
+        self.lines = Lines([make_plan(IDS, protocol=protocol, model=MODELS[way])], ports, clock, self.sink)
+
+    def open(self):
+        self.line = ScriptedLine()
+        return self.line, self.line.clock
+
+    def say(self, given):
+        self.line.script = [pieces for _, pieces in given]
+        self.line.clock.wait_until(self.line.clock.now_ns() + 20_000_000)
+
+    def reads(self):
+        return self._reads
+
+    def exchange(self, given):
+        self.sink.packets.clear()
+        self.say(given)
+        self.job = Reading(self._reads)
+        self.lines.buses[0].load_job(self.job, cyclic=True)
+        self.lines.discard_input(self.lines.buses)
+        self.lines.pump()
+        return [servo_id in self.job.found for servo_id in IDS]
+
+    @property
+    def log(self):
+        return self.sink.packets
+
+    @property
+    def errors(self):
+        return [self.job.found[servo_id][0] for servo_id in IDS]
+
+    @property
+    def noise_bytes(self):
+        return self.lines.buses[0].noise_bytes
+
+
+class TerminalHost(EngineHost):
+    """A pseudo-terminal in real time, on which a thread answers; a reply may be very late."""
+
+    latency_ns = 100_000_000_000
+
+    def open(self):
+        self.servos, self.host = os.openpty()
+        for end in (self.servos, self.host):
+            tty.setraw(end)
+        return SerialPorts([SerialPort(self.host, "pty")]), MonotonicClock()
+
+    def say(self, given):
+        self.thread = threading.Thread(target=self.answer, args=(given,))
+        self.thread.start()
+
+    def answer(self, given):
+        for packet, pieces in given:
+            got = b""
+            while len(got) < len(packet):
+                got += os.read(self.servos, len(packet) - len(got))
+            began = time.monotonic()
+            for at_ns, data in pieces:  # no sooner than the wire allows
+                time.sleep(max(0.0, at_ns / 1e9 + began - time.monotonic()))
+                os.write(self.servos, data)
+
+    def exchange(self, given):
+        valid = super().exchange(given)
+        self.thread.join()
+        return valid
+
+    def close(self):
+        os.close(self.servos)
+        os.close(self.host)
+
+
+class TestVirtualTime(SpoiltReplies):
+    host = EngineHost
+
+
+class TestRealTime(GoodReplies):
+    host = TerminalHost
+
+
+OK, TIMEOUT, GARBLED, REFUSED = (TransactionOutcome[one] for one in ("OK", "TIMEOUT", "GARBLED", "REFUSED"))
+
+
+@pytest.mark.parametrize(
+    ("second", "outcome"),
+    [
+        (protocol2.status_packet(7, 0, bytes(10)), OK),
+        (protocol2.status_packet(7, 0x80, bytes(10)), OK),  # an alert comes with good data
+        (b"", TIMEOUT),
+        (protocol2.status_packet(7, 0, bytes(9)), GARBLED),
+        (protocol2.status_packet(7, 0, bytes(10))[:9], GARBLED),
+        (protocol2.read_range(7, 126, 4), TIMEOUT),  # of another host: the servo did not garble it
+        (protocol2.status_packet(7, 0x07), REFUSED),  # which ends its turn and no other
+    ],
+)
+def test_outcome_of_a_group_read_and_how_long_it_takes(second, outcome):
+    host = EngineHost("sync read")
+    good = [protocol2.status_packet(one, 0, bytes(10)) for one in IDS]
+    pieces = [(400_000, good[0]), (700_000, second), (1_000_000, good[2]), (1_300_000, good[3])]
+    (read,) = host.reads()
+    host.sink.packets.clear()
+    host.exchange([(read.packet, [piece for piece in pieces if piece[1]])])
+    assert host.job.outcomes == [outcome]
+    began_ns = next(at for kind, _, at in host.log if kind is PacketKind.INSTRUCTION)
+    took_ns = host.line.clock.now_ns() - began_ns
+    assert took_ns >= read.timeout_ns if outcome in (TIMEOUT, GARBLED) else took_ns == 1_300_000
+    times = [at for _, _, at in host.job.found.values()]
+    assert times[0] == began_ns + 400_000
+
+
+def test_a_reply_of_the_read_before_is_a_stray():
+    host = EngineHost("sync read")
+    (read,) = host.reads()
+    good = [protocol2.status_packet(one, 0, bytes(10)) for one in IDS]
+    host.exchange([(read.packet, [(100_000, good[0]), (400_000, b"".join(good))])])
+    assert (host.job.outcomes, host.job.strays, len(host.job.found)) == ([OK], 1, 4)
+    host.exchange([(read.packet, [(400_000, good[0]), (500_000, b"".join(good))])])
+    assert (host.job.outcomes, host.job.strays, len(host.job.found)) == ([OK], 1, 4)
