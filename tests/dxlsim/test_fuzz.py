@@ -8,8 +8,9 @@ from __future__ import annotations
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from bench import fuzz_simulation
 from tests.kit.simulated_line import Line, split_statuses
+
+from bench import fuzz_simulation
 
 LIKE_PACKETS = st.sampled_from([0xFF, 0xFD, 0xFE, 0x00, 0x01, 0x02, 0x03, 0x55, 0x74, 0x82, 0x83, 0x92])
 NOISE = st.lists(LIKE_PACKETS | st.integers(0, 255), max_size=60).map(bytes)
