@@ -1,4 +1,4 @@
-"""The compiled kernel does what the parser does, whatever arrives; and what it promises by itself."""
+"""The compiled kernel does what the parser does, whatever arrives; and what it promises on its own."""
 
 import ctypes
 import os
@@ -33,6 +33,8 @@ from dxlwire.port.ports import SerialPort, SerialPorts
 from dxlwire.wire import protocol2
 
 ROOT = Path(__file__).parents[2]
+STEADY = b"\0\2" + bytes(8)
+by_both = pytest.mark.parametrize("by_parser", [False, True], ids=["kernel", "parser"])
 
 
 def test_numbers_that_both_sides_share_are_the_same():
@@ -43,55 +45,52 @@ def test_numbers_that_both_sides_share_are_the_same():
         place = -1
         for name, _, value in (one.partition(" = ") for one in names.split(", ")):
             found[name.strip()] = place = int(value or place + 1)
-    shared = {one.name: int(one) for one in kernel.Answer}
-    shared |= {
-        name: getattr(bus_engine, name) for name in ("FREE_NS", "LATE_NS", "LOST", "ASKED_NS", "SILENCE_NS")
-    }
+    of_engine = ("FREE_NS", "LATE_NS", "LOST", "ASKED_NS", "SILENCE_NS", "MOST_LATE_NS")
+    shared = {one.name: int(one) for one in (*kernel.Answer, PacketKind.INSTRUCTION, PacketKind.STATUS)}
+    shared |= {name: getattr(bus_engine, name) for name in of_engine}
     shared |= {name.upper(): value for name, value in kernel._ENCODINGS.items()}
-    shared |= {"MOST_LATE_NS": bus_engine.MOST_LATE_NS, "AWAITING": kernel.AWAITING}
-    shared |= {"WRITE_TIMEOUT_NS": ports._WRITE_TIMEOUT_NS, "RECORD_HEADER": RECORD_HEADER}
-    shared |= {one.name: int(one) for one in (PacketKind.INSTRUCTION, PacketKind.STATUS)}
+    shared |= {"AWAITING": kernel.AWAITING, "RECORD_HEADER": RECORD_HEADER}
+    shared |= {"WRITE_TIMEOUT_NS": ports._WRITE_TIMEOUT_NS}
     assert {name: found[name] for name in shared} == shared
 
 
-by_both = pytest.mark.parametrize("by_parser", [False, True], ids=["kernel", "parser"])
-
-
-@pytest.mark.parametrize("name", ["single reads", "bulk read", "sync read", "fast sync read", "two layouts"])
-def test_kernel_and_parser_agree_on_whatever_lines_say(name):
-    tally = fuzz.campaign(1_000, seed=len(name), names=[name])
+@pytest.mark.parametrize(
+    ("name", "streams", "by_kernel", "interrupted"),
+    [
+        ("single reads", 1_000, 50, 20),
+        ("bulk read", 1_000, 50, 20),
+        ("sync read", 1_000, 50, 20),
+        ("fast sync read", 1_000, 50, 20),
+        ("two layouts", 1_000, 50, 20),
+        ("bulk read with devices", 500, 20, 10),
+        ("fast bulk read with devices", 500, 20, 10),
+    ],
+)
+def test_kernel_and_parser_agree_on_whatever_lines_say(name, streams, by_kernel, interrupted):
+    tally = fuzz.campaign(streams, seed=len(name), names=[name])
     # neither side of the comparison is empty
-    assert tally.by_kernel > 50
-    assert tally.interrupted > 20
+    assert tally.by_kernel > by_kernel
+    assert tally.interrupted > interrupted
 
 
-@pytest.mark.parametrize("name", ["bulk read with devices", "fast bulk read with devices"])
-def test_kernel_and_parser_agree_on_devices(name):
-    tally = fuzz.campaign(500, seed=len(name), names=[name])
-    assert tally.by_kernel > 20
-    assert tally.interrupted > 10
-
-
-STEADY = b"\0\2" + bytes(8)
+@campaign(ci=1500, night=200_000, release=2_000_000)
+def test_kernel_and_parser_agree_on_many_streams(amount, chance):
+    fuzz.campaign(int(amount), seed=chance.getrandbits(32))
 
 
 def steady(side, dialect, second=STEADY):
     """Run a cycle in which everything says the same again, and the second device of a line these bytes."""
 
     def said(one):
-        return dialect.status_packet(
-            one.servo_id, 0, (second if one.servo_id == 101 else STEADY)[: one.length]
-        )
+        data = second if one.servo_id == 101 else STEADY
+        return dialect.status_packet(one.servo_id, 0, data[: one.length])
+
+    def due(read, place):
+        return at_ns or 10_000 * len(read.packet) + 500_000 * (3 + place)
 
     given = [
         [
-            (
-                read.packet,
-                [
-                    (10_000 * len(read.packet) + 500_000 * (3 + place), said(one))
-                    for place, one in enumerate(read.awaited)
-                ],
-            )
+            (read.packet, [(due(read, place), said(one)) for place, one in enumerate(read.awaited)])
             for read in line
         ]
         for line in side.prepare()
@@ -120,11 +119,6 @@ def test_the_replies_of_two_lines_have_room_in_the_log_beside_one_another():
         steady(side, dialect)
         assert not any(memory[size:]), f"behind {earlier} bytes"
     assert side.ended > 90
-
-
-@campaign(ci=1500, night=200_000, release=2_000_000)
-def test_kernel_and_parser_agree_on_many_streams(amount, chance):
-    fuzz.campaign(int(amount), seed=chance.getrandbits(32))
 
 
 def test_an_object_that_is_absent_or_of_another_source_is_refused(tmp_path, monkeypatch):
@@ -158,21 +152,31 @@ typedef struct Big {
     assert {name: ctypes.sizeof(kind) for name, kind in big._fields_} == sizes
     program = source + "int size(int n) { return n ? sizeof(Big) : sizeof(Small); }"
     (tmp_path / "both.c").write_text("#include <stdint.h>" + program)
-    compiler = shutil.which("cc") or "cc"
-    subprocess.run(
-        [compiler, "-shared", "-fPIC", "-o", tmp_path / "both.so", tmp_path / "both.c"], check=True
-    )
+    command = [
+        shutil.which("cc") or "cc",
+        "-shared",
+        "-fPIC",
+        "-o",
+        tmp_path / "both.so",
+        tmp_path / "both.c",
+    ]
+    subprocess.run(command, check=True)
     found = ctypes.CDLL(str(tmp_path / "both.so"))
     assert [found.size(0), found.size(1)] == [ctypes.sizeof(small), ctypes.sizeof(big)]
 
 
-@pytest.mark.parametrize("call", ["wait_for_bytes", "write_packet", "read_into", "now_ns"])
-def test_an_interrupt_on_virtual_time_comes_out_of_the_kernel(monkeypatch, call):
+@pytest.fixture
+def rig():
+    """Two servos that the kernel reads."""
     rig = start_rig(make_plan((1, 2)))
-    rig.cycles(5)
+    rig.cycles(8)
     assert rig.hardware._by_kernel
-    port = rig.ports.ports[0]
-    owner = {"wait_for_bytes": rig.ports, "now_ns": rig.hardware._kernel}.get(call, port)
+    return rig
+
+
+@pytest.mark.parametrize("call", ["wait_for_bytes", "write_packet", "read_into", "now_ns"])
+def test_an_interrupt_on_virtual_time_comes_out_of_the_kernel(rig, monkeypatch, call):
+    owner = {"wait_for_bytes": rig.ports, "now_ns": rig.hardware._kernel}.get(call, rig.ports.ports[0])
 
     def interrupted(*_):
         raise KeyboardInterrupt
@@ -186,17 +190,11 @@ def test_an_interrupt_on_virtual_time_comes_out_of_the_kernel(monkeypatch, call)
     assert rig.states.valid.all()
 
 
-@pytest.fixture
-def two_lines():
+@pytest.mark.parametrize("accident", [False, True])
+def test_no_row_is_valid_of_a_line_that_took_no_goals(accident):
     rig = start_rig(make_plan((1, 2)), make_plan((3,), name="other", first_row=2))
     rig.cycles(5)
     assert rig.hardware._by_kernel
-    return rig
-
-
-@pytest.mark.parametrize("accident", [False, True])
-def test_no_row_is_valid_of_a_line_that_took_no_goals(two_lines, accident):
-    rig = two_lines
     rig.hardware.read_states()
     rig.ports.ports[0].unplug()
     rig.goals.position[:] += 0.1
@@ -210,14 +208,14 @@ def test_no_row_is_valid_of_a_line_that_took_no_goals(two_lines, accident):
 
 def test_two_servos_that_jump_to_the_place_of_one_another_are_not_believed():
     rig = make_rig(make_plan((1,), first_row=1), make_plan((2,), name="other", first_row=0))
-    shafts = {rig.servo(1): 1.0, rig.servo(2, bus=1): 4.0}
-    for servo, angle in shafts.items():
+    servos = rig.servo(1), rig.servo(2, bus=1)
+    for servo, angle in zip(servos, (1.0, 4.0), strict=True):
         turn_by_hand(servo, angle)
     rig.hardware.start()
     rig.cycles(5)
     assert rig.hardware._by_kernel
     before = rig.states.position.tolist()
-    for servo, angle in zip(shafts, reversed(shafts.values()), strict=True):
+    for servo, angle in zip(servos, (4.0, 1.0), strict=True):
         turn_by_hand(servo, angle)
     rig.hardware.read_states()
     assert rig.states.valid.tolist() == [False, False]
@@ -225,10 +223,7 @@ def test_two_servos_that_jump_to_the_place_of_one_another_are_not_believed():
 
 
 @pytest.mark.parametrize("step", [2.0, -2.0])
-def test_a_servo_that_jumps_is_not_believed_in_either_direction(step):
-    rig = start_rig(make_plan((1, 2)))
-    rig.cycles(8)
-    assert rig.hardware._by_kernel
+def test_a_servo_that_jumps_is_not_believed_in_either_direction(rig, step):
     before = rig.states.position.tolist()
     turn_by_hand(rig.servo(2), rig.servo(2).shaft_angle + step)
     rig.hardware.read_states()
@@ -248,9 +243,7 @@ def test_line_that_is_gone_gets_no_second_packet_with_goals():
 
 
 @pytest.mark.parametrize("moved", [0.0, 0.2])
-def test_servo_that_missed_a_reply_gets_its_goal_as_soon_as_its_torque_was_read(moved):
-    rig = start_rig(make_plan((1, 2)))
-    rig.cycles(8)
+def test_servo_that_missed_a_reply_gets_its_goal_as_soon_as_its_torque_was_read(rig, moved):
     rig.servo(2).silence()
     rig.cycle()
     rig.goals.position[1] += moved  # nothing is sent to it in this state
@@ -262,39 +255,24 @@ def test_servo_that_missed_a_reply_gets_its_goal_as_soon_as_its_torque_was_read(
     assert rig.states.position[1] == pytest.approx(rig.goals.position[1], abs=0.01)
 
 
-def test_what_is_sent_behind_goals_is_awaited_from_when_they_are_off_the_wire():
-    rig = start_rig(make_plan((1, 2)))
-    rig.cycles(5)
+@pytest.mark.parametrize("queued", [0, 100], ids=["at once", "behind what the parser sent"])
+def test_what_is_sent_behind_goals_is_awaited_from_when_they_are_off_the_wire(rig, queued):
     (bus,) = rig.hardware._buses
-    assert rig.hardware._by_kernel
     rig.hardware.read_states()
     rig.goals.position[:] += 0.1
     before_ns = rig.clock.now_ns()
-    rig.hardware.write_goals()
-    assert bus.words[FREE_NS] == before_ns + len(rig.into_bus()[-1]) * bus.byte_ns
-
-
-def test_goals_go_out_behind_what_the_parser_sent():
-    rig = start_rig(make_plan((1, 2)))
-    rig.cycles(5)
-    (bus,) = rig.hardware._buses
-    rig.hardware.read_states()
-    rig.goals.position[:] += 0.1
-    bus.send(bytes(100))  # such as reduced limits of torque
-    before_ns = bus.words[FREE_NS]
+    if queued:
+        bus.send(bytes(queued))  # such as reduced limits of torque
+        before_ns = bus.words[FREE_NS]
     rig.hardware.write_goals()
     assert bus.words[FREE_NS] == before_ns + len(rig.into_bus()[-1]) * bus.byte_ns
 
 
 @pytest.mark.parametrize(("buses", "servos"), [(40, 1), (1, 150), (1, 250)])
-def test_a_large_robot_gets_its_goals_and_what_the_kernel_has_no_room_for_is_read_by_the_parser(
-    buses, servos
-):
+def test_a_robot_for_which_the_kernel_has_no_room_gets_its_goals_and_is_read_by_the_parser(buses, servos):
     plans = [
-        make_plan(
-            range(servos), name=f"bus{index}", first_row=index * servos, model="XM430-W350", protocol=2.0
-        )
-        for index in range(buses)
+        make_plan(range(servos), name=f"bus{row}", first_row=row * servos, model="XM430-W350", protocol=2.0)
+        for row in range(buses)
     ]
     side = fuzz.Side(plans, memoryview(bytearray(2064)))
     side.goals.values[:] = 0.0
@@ -353,96 +331,103 @@ def test_a_doubled_reply_is_logged_in_the_same_cycle_by_kernel_and_parser(by_par
             replies.append([(read.packet, pieces)])
         assert number != 6 or side.hardware._by_kernel is not by_parser
         side.cycle(replies, goals)
-        counts.append(
-            [sum(p.bus == bus and p.kind is PacketKind.STATUS for p in side.log) for bus in range(3)]
-        )
+        statuses = [packet.bus for packet in side.log if packet.kind is PacketKind.STATUS]
+        counts.append([statuses.count(bus) for bus in range(3)])
         assert side.states.valid.all()
     # the parser hears every line that a wait has shown before it waits again; so does the kernel
     assert counts[5:] == [[4, 4, 4], [5, 4, 5], [5, 4, 5]]
 
 
-class TestOnDescriptors:
-    """A line that a test answers itself, through a pseudo-terminal."""
+class Terminal:
+    """Two servos on a pseudo-terminal, which a test answers itself."""
 
-    @pytest.fixture
-    def line(self, request):
-        # a reply may take as long as the adapter is said to take
-        latency_ns = getattr(request, "param", 0)
-        plan = make_plan((1, 2), model="XM430-W350", protocol=2.0, latency_ns=latency_ns)
-        ours, theirs = os.openpty()
-        for end in (ours, theirs):
+    def __init__(self, latency_ns=0):
+        self.plan = make_plan((1, 2), model="XM430-W350", protocol=2.0, latency_ns=latency_ns)
+        self.ours, self.theirs = os.openpty()
+        for end in (self.ours, self.theirs):
             tty.setraw(end)
-        rig = make_rig(plan)
-        states, goals = States.empty(2), Commands.empty(2)
-        ports = SerialPorts([SerialPort(theirs, "pty")])
-        lines = Lines([plan], ports, MonotonicClock(), rig.packets, lambda: rig.beats.append(0))
-        hardware = DynamixelHardware(lines, rig.packets, ServoArrays(states, goals), rig.events)
-        (servos,) = hardware._servos
-        while servos.reads.plan().program is None:  # as after some cycles in which every servo answered
-            servos.reads.end_cycle()
-        yield plan, hardware, ours, states, rig
-        for end in (ours, theirs):
+        self.rig, self.states = make_rig(self.plan), States.empty(2)
+        serial = SerialPorts([SerialPort(self.theirs, "pty")])
+        packets, beat = self.rig.packets, lambda: self.rig.beats.append(0)
+        lines = Lines([self.plan], serial, MonotonicClock(), packets, beat)
+        arrays = ServoArrays(self.states, Commands.empty(2))
+        self.hardware = DynamixelHardware(lines, packets, arrays, self.rig.events)
+        (self.servos,), (self.bus,) = self.hardware._servos, self.hardware._buses
+        while self.servos.reads.plan().program is None:  # as after cycles in which every servo answered
+            self.servos.reads.end_cycle()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        for end in (self.ours, self.theirs):
             os.close(end)
 
-    @pytest.mark.parametrize("line", [10_000_000_000], indirect=True)
-    def test_a_reply_is_taken_stamped_and_logged(self, line):
-        plan, hardware, ours, states, rig = line
-        (read,) = plan.reads
-        said = [protocol2.status_packet(one.servo_id, 0, bytes(one.length)) for one in read.awaited]
-        answering = Thread(target=answer, args=(ours, len(read.packet), b"".join(said)))
-        answering.start()
-        hardware.read_states()
-        answering.join()
-        assert states.valid.tolist() == [True, True]
-        kinds = [packet.kind for packet in rig.packets.list]
-        assert kinds == [PacketKind.INSTRUCTION, PacketKind.STATUS, PacketKind.STATUS]
-        sent, first, _ = rig.packets.list
-        assert sent.first_ns <= sent.last_ns <= first.first_ns
-        assert hardware._servos[0].reads._calm == CALM_CYCLES  # the parser has read none
+    def answer(self, size, replies):
+        """Answer a read on the other end, no sooner than the wire allows."""
+        got = b""
+        while len(got) < size:
+            got += os.read(self.ours, size - len(got))
+        time.sleep(0.002)
+        os.write(self.ours, replies)
 
-    def test_line_that_takes_no_bytes_is_lost_and_does_not_stop_the_loop(self, line):
-        hardware = line[1]
-        (port,) = hardware._lines.ports.ports
+
+def test_a_reply_on_a_descriptor_is_taken_stamped_and_logged():
+    with Terminal(latency_ns=10_000_000_000) as line:  # a reply may take so long
+        (read,) = line.plan.reads
+        said = b"".join(protocol2.status_packet(one.servo_id, 0, bytes(one.length)) for one in read.awaited)
+        answering = Thread(target=line.answer, args=(len(read.packet), said))
+        answering.start()
+        line.hardware.read_states()
+        answering.join()
+        assert line.states.valid.tolist() == [True, True]
+        sent, first, second = line.rig.packets.list
+        assert [one.kind for one in (sent, first, second)] == [
+            PacketKind.INSTRUCTION,
+            *[PacketKind.STATUS] * 2,
+        ]
+        assert sent.first_ns <= sent.last_ns <= first.first_ns
+        assert line.servos.reads._calm == CALM_CYCLES  # the parser has read none
+
+
+def test_line_that_takes_no_bytes_is_lost_and_does_not_stop_the_loop():
+    with Terminal() as line:
         emptied, full = os.pipe2(os.O_NONBLOCK)  # a terminal makes room by itself
         for size in (4096, 1):
             with suppress(BlockingIOError):
                 while True:
                     os.write(full, bytes(size))
-        os.dup2(full, port.descriptor)
-        hardware._servos[0].life.torqued[:] = True
-        hardware._goals.position[:] = 0.1
+        os.dup2(full, line.theirs)
+        line.servos.life.torqued[:] = True
+        line.hardware._goals.position[:] = 0.1
         end = Timer(5.0, os.read, (emptied, 1 << 20))  # of a write that has none itself
         end.start()
-        hardware.write_goals()
+        line.hardware.write_goals()
         end.cancel()
         for descriptor in (emptied, full):
             os.close(descriptor)
-        (bus,) = hardware._buses
-        assert "accepts no more bytes" in str(bus.failure)
-
-    def test_silence_ends_in_the_parser_and_the_loop_shows_that_it_lives(self, line):
-        _, hardware, _, states, rig = line
-        hardware.read_states()
-        assert states.valid.tolist() == [False, False]
-        assert len(rig.beats) > 1  # a beat a millisecond while replies are awaited; a busy machine has fewer
-        assert hardware._servos[0].reads._calm == 0  # the parser ended the cycle
-
-    def test_a_line_that_hangs_up_is_gone_and_names_its_port(self, line):
-        _, hardware, ours, states, _ = line
-        os.dup2(os.open(os.devnull, os.O_RDONLY), ours)  # the other end is closed
-        hardware.read_states()
-        (bus,) = hardware._buses
-        assert "pty is gone" in str(bus.failure)
-        assert not states.valid.any()
+        assert "accepts no more bytes" in str(line.bus.failure)
 
 
-def answer(terminal, size, replies):
-    """Answer a read on the other end, no sooner than the wire allows."""
-    got = b""
-    while len(got) < size:
-        got += os.read(terminal, size - len(got))
-    time.sleep(0.002)
-    os.write(terminal, replies)
+def test_silence_ends_in_the_parser_and_the_loop_shows_that_it_lives():
+    with Terminal() as line:
+        line.hardware.read_states()
+        assert line.states.valid.tolist() == [False, False]
+        assert (
+            len(line.rig.beats) > 1
+        )  # a beat a millisecond while replies are awaited; a busy machine has fewer
+        assert line.servos.reads._calm == 0  # the parser ended the cycle
+
+
+def test_a_line_that_hangs_up_is_gone_and_names_its_port():
+    with Terminal() as line:
+        os.dup2(os.open(os.devnull, os.O_RDONLY), line.ours)  # the other end is closed
+        line.hardware.read_states()
+        assert "pty is gone" in str(line.bus.failure)
+        assert not line.states.valid.any()
+
+
+# The build
 
 
 @pytest.fixture
@@ -461,10 +446,10 @@ def build(tmp_path, monkeypatch):
 )
 def test_a_build_asks_for_a_compiler_where_none_works(build, tmp_path, monkeypatch, compiler, works):
     monkeypatch.setenv("CC", compiler)
-    monkeypatch.setattr(build.hatchling.build, "get_requires_for_build_wheel", lambda _: ["first"])
-    assert build.get_requires_for_build_wheel() == (["first"] if works else ["first", "ziglang"])
-    monkeypatch.setattr(build.hatchling.build, "get_requires_for_build_editable", lambda _: ["editables"])
-    assert build.get_requires_for_build_editable() == (["editables"] if works else ["editables", "ziglang"])
+    for kind in ("wheel", "editable"):
+        monkeypatch.setattr(build.hatchling.build, f"get_requires_for_build_{kind}", lambda _: ["first"])
+        needed = getattr(build, f"get_requires_for_build_{kind}")()
+        assert needed == (["first"] if works else ["first", "ziglang"])
     found = build.system_compiler(tmp_path)
     assert found == (compiler.split() if works else [])
     why = build.compile_kernel(tmp_path, found or compiler.split(), tmp_path / "libkernel.so")
@@ -485,12 +470,12 @@ def test_a_build_without_any_compiler_fails_and_names_the_fix(build, tmp_path, m
 def test_a_wheel_has_every_object_that_is_compiled(build, tmp_path):
     hook, data = build.KernelHook(str(tmp_path), {}, None, None, "", "wheel"), {"force_include": {}}
     hook.initialize("standard", data)
-    names = [
+    rooms = (
         "dxlwire/exchange/libkernel.so",
         "dxlrun/control/libgate.so",
         "dxlrun/channels/libshared_memory.so",
-    ]
-    assert list(data["force_include"].values()) == names
+    )
+    assert tuple(data["force_include"].values()) == rooms
     assert all(Path(made).stat().st_size for made in data["force_include"])
     hook.finalize("standard", data, "")
     assert not any(Path(made).exists() for made in data["force_include"])
