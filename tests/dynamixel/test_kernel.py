@@ -85,16 +85,11 @@ def steady(side, dialect, second=STEADY):
         data = second if one.servo_id == 101 else STEADY
         return dialect.status_packet(one.servo_id, 0, data[: one.length])
 
-    def due(read, place):
-        return at_ns or 10_000 * len(read.packet) + 500_000 * (3 + place)
+    def answers(read):
+        sent_ns = 10_000 * len(read.packet)
+        return [(sent_ns + 500_000 * (3 + place), said(one)) for place, one in enumerate(read.awaited)]
 
-    given = [
-        [
-            (read.packet, [(due(read, place), said(one)) for place, one in enumerate(read.awaited)])
-            for read in line
-        ]
-        for line in side.prepare()
-    ]
+    given = [[(read.packet, answers(read)) for read in line] for line in side.prepare()]
     side.cycle(given, np.full_like(side.goals.values, np.nan))
 
 
