@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import re
 import shlex
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
-from concurrent.futures import Executor, Future
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -70,41 +69,31 @@ def season(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return Path(shutil.copytree(made, tmp_path / "season"))
 
 
+REPORTS: dict[bytes, Any] = {}
+"""Of each log that was read in this process, by its content"""
+
+
 @pytest.fixture
 def here(monkeypatch: pytest.MonkeyPatch) -> Here:
-    """Let `dxlrun logs` read logs in this process."""
+    """Let `dxlrun logs` read logs in this process, each content once for all tests."""
     read: Here = []
+    analyze = season_runs.analyze
 
-    class InThisProcess(Executor):
-        def submit(self, work, log, /):  # type: ignore[no-untyped-def, override]
-            read.append(log.name)
-            future: Future[object] = Future()
-            future.set_result(work(log))
-            return future
+    def analyze_once(reader: Any) -> Any:
+        if not reader.about.complete or not reader.path.is_file():
+            return analyze(reader)
+        content = hashlib.sha256(reader.path.read_bytes()).digest()
+        if content not in REPORTS:
+            REPORTS[content] = analyze(reader)
+        return REPORTS[content]
 
-    @contextmanager
-    def pool(count: int) -> Iterator[Executor]:
-        yield InThisProcess()
+    def together(logs: Sequence[season_runs.FoundLog], *_: object) -> dict[str, season_runs.Row]:
+        read.extend(log.name for log in logs)
+        return {log.name: season_runs.row_of(log) for log in logs}
 
-    monkeypatch.setattr(season_runs, "processes", pool)
+    monkeypatch.setattr(season_runs, "analyze", analyze_once)
+    monkeypatch.setattr(season_runs, "_together", together)
     return read
-
-
-ROWS: dict[str, season_runs.Row] = {}  # Of the logs in `made`
-
-
-@pytest.fixture
-def known(season: Path, here: Here, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The same; each log is analyzed once for all tests."""
-    row_of = season_runs.row_of
-
-    def known(log: season_runs.FoundLog) -> season_runs.Row:
-        if log.name not in ROWS:
-            ROWS[log.name] = row_of(log)
-        return ROWS[log.name]
-
-    monkeypatch.setattr(season_runs, "row_of", known)
-    return season
 
 
 def test_rows_are_what_the_analysis_of_each_log_has(season: Path, here: Here, dxlrun: Dxlrun) -> None:
@@ -164,9 +153,9 @@ def test_a_log_is_read_once_and_again_only_when_it_changed(season: Path, here: H
 
 @pytest.mark.parametrize("damage", ["flip", "cut", "text", "code"])
 def test_a_table_that_is_damaged_or_of_other_code_is_made_anew(
-    known: Path, here: Here, dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch, damage: str
+    season: Path, here: Here, dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch, damage: str
 ) -> None:
-    first = rows(dxlrun("logs", known, "--json"))
+    first = rows(dxlrun("logs", season, "--json"))
     here.clear()
     (file,) = season_runs.cache_directory().rglob("*.parquet")
     data = file.read_bytes()
@@ -177,29 +166,26 @@ def test_a_table_that_is_damaged_or_of_other_code_is_made_anew(
     else:
         flipped = data[:-20] + bytes([data[-20] ^ 0xFF]) + data[-19:]
         file.write_bytes(data[: len(data) // 2] if damage == "cut" else flipped)
-    assert rows(dxlrun("logs", known, "--json")) == first
+    assert rows(dxlrun("logs", season, "--json")) == first
     assert here == NAMES
 
 
 @pytest.mark.parametrize(
-    ("words", "expected"),
+    ("where", "sort", "expected"),
     [
-        (("--where", "robot = 'single_joint'"), ["may/third.mcap"]),
-        (("--where", "unreadable IS NOT NULL"), ["may/broken.mcap"]),
-        (("--where", "cycles > 30", "--sort", "cycles DESC"), ["may/third.mcap", "may/second.mcap"]),
-        (
-            ("--where", "list_contains(findings, 'kept_rate')"),
-            [name for name in NAMES if "broken" not in name],
-        ),
-        (("--where", "robot LIKE 'single%' -- and no more"), ["may/third.mcap"]),
-        (("--sort", "log DESC"), NAMES[::-1]),
-        (("--where", "cycles = (SELECT max(cycles) FROM logs)"), ["may/third.mcap"]),
+        ("robot = 'single_joint'", "log", ["may/third.mcap"]),
+        ("unreadable IS NOT NULL", "log", ["may/broken.mcap"]),
+        ("cycles > 30", "cycles DESC", ["may/third.mcap", "may/second.mcap"]),
+        ("list_contains(findings, 'kept_rate')", "log", [name for name in NAMES if "broken" not in name]),
+        ("robot LIKE 'single%' -- and no more", "log", ["may/third.mcap"]),
+        ("true", "log DESC", NAMES[::-1]),
+        ("cycles = (SELECT max(cycles) FROM logs)", "log", ["may/third.mcap"]),
     ],
 )
-def test_conditions_choose_logs(
-    known: Path, dxlrun: Dxlrun, words: tuple[str, ...], expected: list[str]
+def test_conditions_choose_logs(  # noqa: PLR0917  fixtures, and a case
+    season: Path, here: Here, dxlrun: Dxlrun, where: str, sort: str, expected: list[str]
 ) -> None:
-    assert list(rows(dxlrun("logs", known, "--json", *words))) == expected
+    assert list(rows(dxlrun("logs", season, "--json", "--where", where, "--sort", sort))) == expected
 
 
 def test_names_that_are_not_utf_8_and_pipes_hide_no_log(season: Path, here: Here, dxlrun: Dxlrun) -> None:
@@ -214,60 +200,66 @@ def test_names_that_are_not_utf_8_and_pipes_hide_no_log(season: Path, here: Here
     assert "pipe.mcap" in result_of(dxlrun("logs", season, "--json").out)["other_files"]
 
 
-def test_logs_md_its_questions_are_answered(known: Path, dxlrun: Dxlrun) -> None:
+def test_logs_md_its_questions_are_answered(season: Path, here: Here, dxlrun: Dxlrun) -> None:
     page = page_text("logs.md")
     lines = re.findall(r"^    dxlrun logs (?!.*--prune)(.+)$", page, re.MULTILINE)
     assert len(lines) == 4
     for line in lines:
         place, *words = shlex.split(line)
         assert place in ("logs", "s3://lab/torso")
-        assert dxlrun("logs", known, *words).code == 0, line
+        assert dxlrun("logs", season, *words).code == 0, line
 
 
-def test_the_table_for_people(known: Path, dxlrun: Dxlrun) -> None:
-    said = dxlrun("logs", known)
-    assert said.errors == [f"1 other file is in {known}: notes.txt"]
+def test_the_table_for_people(season: Path, here: Here, dxlrun: Dxlrun) -> None:
+    said = dxlrun("logs", season)
+    assert said.errors == [f"1 other file is in {season}: notes.txt"]
     assert "unreadable" in said.out
     assert "this is not an MCAP file" in " ".join(said.out.split())
     assert said.out.rstrip().endswith("5 of 5 logs")
-    assert dxlrun("logs", known, "--where", "lost > 5").out.strip() == "0 of 5 logs"
+    assert dxlrun("logs", season, "--where", "lost > 5").out.strip() == "0 of 5 logs"
 
 
-def test_a_program_of_its_own_prints_nothing_at_its_end(known: Path) -> None:
+def test_a_program_of_its_own_prints_nothing_at_its_end(season: Path) -> None:
     """DuckDB would print there what of it is not collected."""
-    words = [Path(sys.executable).with_name("dxlrun"), "logs", known / "may", "--where", "lost > 5"]
+    words = [Path(sys.executable).with_name("dxlrun"), "logs", season / "may", "--where", "lost > 5"]
     done = subprocess.run(words, capture_output=True, text=True, check=True)
     assert (done.stdout.strip(), done.stderr) == ("0 of 4 logs", "")
 
 
 @pytest.mark.parametrize(
-    ("words", "sentence"),
+    ("option", "text", "sentence"),
     [
-        (("--where", "wrst > 3"), 'Referenced column "wrst" not found'),
-        (("--where", "wrst > 3"), "logs has log, robot, began"),
-        (("--where", "lost >"), "--where: syntax error"),
-        (("--where", "lost > 1; DROP TABLE logs"), "--where: "),
-        (("--where", "true) TO '/tmp/x'; --"), "--where: "),
-        (("--where", "lost = 1, true"), "--where: "),
-        (("--where", "true; SET lock_configuration = false"), "--where: "),
-        (("--where", "log IN (SELECT content FROM read_text('/etc/hostname'))"), "disabled by configuration"),
-        (("--where", "log IN (SELECT file FROM glob('/etc/*'))"), "disabled by configuration"),
-        (("--where", "log IN (SELECT * FROM 'notes.txt')"), "--where: "),
-        (("--where", "log IN (SELECT log FROM runs)"), "--where: "),
-        (("--where", "robot::int > 3"), "--where or --sort: "),
-        (("--sort", "lost; DROP TABLE logs"), "--sort: "),
-        (("--sort", "lost SIDEWAYS"), "--sort: syntax error"),
+        ("--where", "wrst > 3", 'Referenced column "wrst" not found'),
+        ("--where", "wrst > 3", "logs has log, robot, began"),
+        ("--where", "lost >", "--where: syntax error"),
+        ("--where", "lost > 1; DROP TABLE logs", "--where: "),
+        ("--where", "true) TO '/tmp/x'; --", "--where: "),
+        ("--where", "lost = 1, true", "--where: "),
+        ("--where", "true; SET lock_configuration = false", "--where: "),
+        ("--where", "log IN (SELECT content FROM read_text('/etc/hostname'))", "disabled by configuration"),
+        ("--where", "log IN (SELECT file FROM glob('/etc/*'))", "disabled by configuration"),
+        ("--where", "log IN (SELECT * FROM 'notes.txt')", "--where: "),
+        ("--where", "log IN (SELECT log FROM runs)", "--where: "),
+        ("--where", "robot::int > 3", "--where or --sort: "),
+        ("--sort", "lost; DROP TABLE logs", "--sort: "),
+        ("--sort", "lost SIDEWAYS", "--sort: syntax error"),
     ],
 )
-def test_a_wrong_question_is_one_sentence_and_reads_or_writes_nothing(
-    known: Path, dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...], sentence: str
+def test_wrong_question_is_one_sentence_and_reads_or_writes_nothing(  # noqa: PLR0917  fixtures, and a case
+    season: Path,
+    here: Here,
+    dxlrun: Dxlrun,
+    monkeypatch: pytest.MonkeyPatch,
+    option: str,
+    text: str,
+    sentence: str,
 ) -> None:
-    monkeypatch.chdir(known)
-    before = sorted(known.rglob("*"))
-    said = dxlrun("logs", known, *words)
+    monkeypatch.chdir(season)
+    before = sorted(season.rglob("*"))
+    said = dxlrun("logs", season, option, text)
     assert (said.code, len(said.errors)) == (2, 1), said
     assert sentence in said.errors[0]
-    assert sorted(known.rglob("*")) == before
+    assert sorted(season.rglob("*")) == before
 
 
 @pytest.mark.parametrize(
@@ -276,10 +268,7 @@ def test_a_wrong_question_is_one_sentence_and_reads_or_writes_nothing(
         ("missing", "not found; give the directory of logs"),
         ("file", "`dxlrun analyze`"),
         ("empty", "no logs (.mcap) found"),
-        (
-            "no duckdb",
-            "duckdb and pyarrow (not installed); install it: `pip install 'dxlrun[logs]'`",
-        ),
+        ("no duckdb", "duckdb and pyarrow (not installed); install it: `pip install 'dxlrun[logs]'`"),
         ("no cache", "set XDG_CACHE_HOME to another directory"),
     ],
 )
@@ -298,12 +287,12 @@ def test_what_cannot_be_is_one_sentence(  # noqa: PLR0917  fixtures
     assert sentence in said.errors[0]
 
 
-def test_a_log_in_parts_is_one_log(known: Path, dxlrun: Dxlrun) -> None:
-    path = known / "torso_1"
+def test_a_log_in_parts_is_one_log(season: Path, here: Here, dxlrun: Dxlrun) -> None:
+    path = season / "torso_1"
     plan = plan_of(ROBOTS / "bioloid_torso.yaml", duration_s=2.0)
     VirtualRobot(replace(plan, recording=RecordingPlan(split_ns=1_000_000_000)), log=path).run()
     (path / "notes.txt").touch()
-    said = dxlrun("logs", known, "--json")
+    said = dxlrun("logs", season, "--json")
     row = rows(said)["torso_1"]
     assert row["cycles"] == analyze_log(path).totals.periods.records == 100
     assert row["bytes"] == sum(part.stat().st_size for part in path.glob("*.mcap"))
@@ -312,10 +301,10 @@ def test_a_log_in_parts_is_one_log(known: Path, dxlrun: Dxlrun) -> None:
     assert list(rows(dxlrun("logs", path, "--json"))) == ["torso_1"]
 
 
-def test_a_measurement_is_no_run_that_failed(known: Path, dxlrun: Dxlrun) -> None:
+def test_a_measurement_is_no_run_that_failed(season: Path, here: Here, dxlrun: Dxlrun) -> None:
     record = {latency_log.METADATA_NAME: {"settings": "{}"}}
-    LogWriter(known / "latency.mcap", LogHeader("latency", (), (), (), 10**6, 0, metadata=record)).close()
-    row = rows(dxlrun("logs", known, "--json"))["latency.mcap"]
+    LogWriter(season / "latency.mcap", LogHeader("latency", (), (), (), 10**6, 0, metadata=record)).close()
+    row = rows(dxlrun("logs", season, "--json"))["latency.mcap"]
     assert row["unreadable"] == "a measurement of `dxlrun latency`, not a run; `dxlrun analyze` shows it"
     assert row["good"] is None
 

@@ -469,6 +469,11 @@ def wake_late_each_second(story: Story, for_s: float) -> float:
     return story.random.uniform(0.5, 2.5) / story.kind.rate if is_busy else 0.0
 
 
+@line("the loop stands still for <n> ms every <n> s", once)
+def stand_still(story: Story, since_s: float, ms: float, period_s: float) -> None:
+    story.stand_still("still", since_s, round(ms * MS), round(period_s * S))
+
+
 @line("in real time: a program that never waits has the core of the loop", once)
 def hog(story: Story, _: float) -> None:
     story.disturb = hog_on_the_core_of_the_loop

@@ -19,6 +19,7 @@ from typing import Any
 
 import pytest
 from msgspec.structs import replace
+from tests.analysis.verdicts.live import TooLongError
 from tests.kit.awaited import DEADLINE_S
 
 from dxlrun.channels.commands import CommandMessage, QueueInbox
@@ -301,6 +302,22 @@ class Story:
 
         self.prepared.append(lambda: setattr(self.virtual.clock, "__class__", Stalling))
 
+    def stand_still(self, kind: str, since_s: float, for_ns: int, every_ns: int) -> None:
+        """Let the loop get no processor for moments, wherever it is: the next look at the clock is later."""
+        story, due_ns = self, [round(since_s * S)]
+
+        class Starved(VirtualClock):
+            __slots__ = ()
+
+            def now_ns(self) -> int:
+                if super().now_ns() >= due_ns[0]:
+                    due_ns[0] += every_ns
+                    story.evidence[kind] += 1
+                    super().wait_until(super().now_ns() + for_ns)
+                return super().now_ns()
+
+        self.prepared.append(lambda: setattr(self.virtual.clock, "__class__", Starved))
+
     # The run
 
     def run(self) -> Path:
@@ -345,6 +362,11 @@ class Story:
             try:
                 self.evidence[disturb(process)] += 1
                 said, _ = process.communicate(timeout=DEADLINE_S)
+            except TooLongError:
+                process.kill()
+                for log in self.directory.glob("*.mcap"):
+                    log.unlink()
+                return self._run_live(file, played, disturb)
             finally:
                 process.kill()
         logs = list(self.directory.glob("*.mcap"))
