@@ -79,10 +79,7 @@ def test_a_servo_that_failed_before_or_much_later_did_not_by_it(
 def test_all_servos_that_an_instruction_means_are_told(protocol: float) -> None:
     address, size = item(protocol, "torque_enable")
     several = WIRES[protocol].sync_write(address, size, {3: b"\0", 5: b"\1", 9: b"\0"})
-    assert told(protocol, several) == (
-        "torque_enable to IDs 3, 5",
-        False,
-    )
+    assert told(protocol, several) == ("torque_enable to IDs 3, 5", False)
     everybody = WIRES[protocol].factory_reset(254, *([protocol2.Reset.ALL] if protocol > 1 else []))
     text, _ = told(protocol, everybody)
     assert text == "a factory reset to IDs 3, 4, 5"

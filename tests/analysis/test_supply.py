@@ -80,12 +80,7 @@ RISES = -np.minimum(5.0, TIME)
 RUNS_DOWN = np.linspace(0, 2.0, len(TIME)) + 0.5 * LOADS.sum(axis=1)
 DIP = np.where((TIME > 6.4) & (TIME < 8.9), 5.0, 0.0)  # at a time of more load, but only once
 SUPPLIES: dict[str, tuple[Floats, int | list[int], str, str]] = {
-    "sags with the load of all": (
-        volts(None, 1.2 * LOADS.sum(axis=1)),
-        0,
-        "main",
-        "it falls under load",
-    ),
+    "sags with the load of all": (volts(None, 1.2 * LOADS.sum(axis=1)), 0, "main", "it falls under load"),
     "runs down": (volts(None, RUNS_DOWN), 0, "main", "was 9.1 V at its lowest (19.6 s of the run)"),
     "and says so": (volts(None, RUNS_DOWN), 0, "main", "it fell during the run"),
     "creeps up": (volts(None, RISES), [1, 1, 1, 1], "main", "and 17.0 V at most; an input voltage error was"),

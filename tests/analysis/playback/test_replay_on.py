@@ -128,10 +128,7 @@ def test_a_speed_that_is_slow_enough_is_named(swing: Path, place: Path, dxlrun: 
         (["--speed", "nan"], "--speed nan: give a factor"),
         (["--from", "-1"], "--from -1: give seconds since the start of the recording"),
         (["--from", "3", "--to", "2"], "--from 3 is not before --to 2"),
-        (
-            ["--from", "100"],
-            "no motion between --from and --to; choose times from 0.000 s",
-        ),
+        (["--from", "100"], "no motion between --from and --to; choose times from 0.000 s"),
         (["--map", "pan"], "--map pan: write RECORDED=JOINT"),
         (["--map", "pan=tilt"], "--map gives several recorded joints the name tilt"),
         (["--map", "pin=tilt"], "--map pin: the recording has no joint pin; did you mean pan?"),

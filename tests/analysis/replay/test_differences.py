@@ -219,12 +219,7 @@ def test_messages_from_activation_to_deactivation_are_the_same(pair_log: Path, c
 
 @pytest.mark.parametrize(
     ("index", "at", "cycle", "field"),
-    [
-        (0, 4, -1, "header.stamp.sec"),
-        (1, 20, 0, "number"),
-        (30, -8, 29, "sum[1]"),
-        (51, -16, 49, "sum[0]"),
-    ],
+    [(0, 4, -1, "header.stamp.sec"), (1, 20, 0, "number"), (30, -8, 29, "sum[1]"), (51, -16, 49, "sum[0]")],
 )
 def test_one_bit_of_one_message_is_named(  # noqa: PLR0917  fixtures, and a case
     pair_log: Path, changed: Changed, index: int, at: int, cycle: int, field: str

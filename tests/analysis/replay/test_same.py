@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -29,20 +31,15 @@ DXLRUN = Path(sys.executable).with_name("dxlrun")
 
 
 def motions_for(robot: Path) -> list[Path]:
-    """Return the motion that fits a robot, if there is one: it names its controllers."""
+    """Return the motion that fits a robot, if there is one; the robot file names its controllers."""
     text = robot.read_text()
     for motion in sorted((ROBOTS / "motions").glob("*.yaml")):
-        names = {
-            line.split("controller:")[1].strip()
-            for line in motion.read_text().splitlines()
-            if "controller:" in line
-        }
-        try:
-            if all(f"{name}:" in text for name in names):
-                compile_files(robot, {}, [motion])
-                return [motion]
-        except InputError:
+        names = re.findall(r"controller: (\w+)", motion.read_text())
+        if "include:" not in text and not all(f"{name}:" in text for name in names):
             continue
+        with suppress(InputError):
+            compile_files(robot, {}, [motion])
+            return [motion]
     return []
 
 

@@ -280,11 +280,7 @@ def test_of_several_controllers_of_a_joint_the_active_one_is_named(
 @pytest.mark.parametrize(
     ("story", "change", "sentence"),
     [
-        (
-            "rates",
-            command("rate", data=rate(50).data),
-            "in the replay: the log is damaged, or",
-        ),
+        ("rates", command("rate", data=rate(50).data), "in the replay: the log is damaged, or"),
         ("rates", command("rate", kind="resume"), "contradict"),
         (
             "a pause in a motion",
