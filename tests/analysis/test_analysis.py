@@ -162,20 +162,6 @@ def test_a_servo_that_was_silent_is_named(write: Make) -> None:
     )
 
 
-def test_a_late_reply_of_another_servo_is_nobodys_answer(write: Make) -> None:
-    packets = [Wire(PacketKind.INSTRUCTION, 21, 0, ASK_21), Wire(PacketKind.STATUS, 5, 500, ANSWER)]
-    packets.append(Wire(PacketKind.INSTRUCTION, 254, 1000, GOALS))
-    elbow, head = analyze_log(write([], packets)).totals.servos
-    assert (elbow.replies, elbow.lost) == (1, 0)
-    assert head.lost == 1
-
-
-def test_packets_of_two_rings_are_paired_by_time(write: Make) -> None:
-    packets = [*asked_and_answered(20_000), *asked_and_answered(0)]
-    (servo,) = analyze_log(write([], [packets[0], packets[2], packets[1], packets[3]])).totals.servos
-    assert (servo.asked, servo.lost, servo.reply_max_us) == (2, 0, 640)
-
-
 def test_error_bits_are_named(write: Make) -> None:
     packets = [*asked_and_answered(0), *asked_and_answered(20_000, error=0x24)]
     report = analyze_log(write([Cycle(0)], packets))
@@ -228,11 +214,6 @@ def test_errors_gaps_and_a_log_without_end_are_reported(write: Make) -> None:
         ("recorder_gap", 1),
         ("loop_started", 1),
     ]
-
-
-def test_a_finished_log_with_gaps_counts_them(write: Make) -> None:
-    report = analyze_log(write([Cycle(0)], gaps=4))
-    assert (report.totals.gaps, report.about.complete) == (4, True)
 
 
 def test_a_run_without_a_cycle_is_reported(write: Make) -> None:
