@@ -9,7 +9,7 @@ A case has a name, indented lines about the run (`GIVEN` reads them, several of 
 without any it is a good one), and what is expected of the verdict on it:
 
     => good, => not good, => word WORD
-    => 1: TEXT                        the sentence with this number begins so
+    => 1: TEXT                        the sentence with this number begins so; `1 lacks: TEXT`: lacks it
     => any: TEXT, => none: TEXT       it is in a sentence or a remedy, or in none
     => has CODE SUBJECT as RANK       there is such a finding; `=> no CODE`: there is not
     => says CODE SUBJECT: TEXT        its sentence has the text; `fix`: its remedy; `no fix`: it has not
@@ -215,6 +215,8 @@ def holds(verdict: Any, text: str) -> bool:
         return bool(verdict.word == text.removeprefix("word "))
     if word.isdigit():
         return bool(verdict.sentences[int(word)].startswith(rest))
+    if word.endswith(" lacks"):
+        return rest not in verdict.sentences[int(word.removesuffix(" lacks"))]
     if word in ("any", "none"):
         return any(rest in one.line for one in verdict.findings) == (word == "any")
     found = re.fullmatch(r"(has|no fix|no|says|fix) (\w+) ?(.*?)(?: as (\w+))?", word)
