@@ -40,7 +40,7 @@ from dxlrun.run.virtual_run import VirtualRobot, run_virtual
 from dxlrun.testing import plan_of
 
 Meanwhile = Callable[[float, Callable[[VirtualRobot], object]], None]
-GOOD = RunSummary(0, "ended", 100, 2, 2.03, ())
+GOOD = RunSummary(0, "ended", 100, 2, 2.03, (), events=EventTotals(goals=GoalTotals()))
 
 
 class Runs:
@@ -247,6 +247,16 @@ def test_played_motion_that_missed_its_goal_fails_the_run(
     interrupted = ends("aborted", own, RUN_ENDED, exit_code=130, reason="interrupted")
     assert (interrupted.code, interrupted.out.split(": ")[1]) == (130, "interrupted")
     assert ends("missed", own, exit_code=130, reason="interrupted").code == 1
+
+
+def test_goals_of_a_loop_that_was_killed_are_unknown(
+    dxlrun: Dxlrun, runs: Runs, torso: Path, three_parts: Path
+) -> None:
+    runs.answer = replace(GOOD, exit_code=1, reason="fault", events=EventTotals(), log="a.mcap")
+    unknown = "reached their goals is unknown: the loop did not say so; dxlrun analyze a.mcap reads it from"
+    assert unknown in (said := dxlrun(torso, "--play", three_parts)).out
+    assert (said.code, "never began" in said.out) == (1, False)
+    assert "unknown" not in dxlrun(torso).out
 
 
 def test_controller_with_a_fallback_may_fail(torso: Path) -> None:

@@ -403,7 +403,8 @@ class EventTotals(msgspec.Struct, frozen=True):
 
     errors: tuple[EventGroup, ...] = ()
     """Events that are errors, and takeovers that controllers requested, counted in groups."""
-    goals: GoalTotals = GoalTotals()
+    goals: GoalTotals | None = None
+    """None: unknown, because the loop was killed before it could report them."""
     started_ns: int = 0
     """Time at which the loop started, ns of the run's clock; 0: it did not."""
 

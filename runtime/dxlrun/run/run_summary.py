@@ -161,7 +161,7 @@ def run_verdict(run: RunSummary, plan: Plan) -> RunVerdict:
         happened.append(f"at {after_s:.1f} s {one.source} took over the robot: {last_line(one)}")
     ran_ns = (run.cycles + run.skipped) * loop.period_ns
     happened.append(f"ran for {ran_ns / 1e9:.1f} s")
-    if events.goals.asked:
+    if events.goals and events.goals.asked:
         asked = counted(events.goals.asked, "goal", "goals")
         happened.append(f"{events.goals.reached} of {asked} reached")
     kept, rate = _rate(run, plan)
@@ -174,7 +174,12 @@ def run_verdict(run: RunSummary, plan: Plan) -> RunVerdict:
         sentences.append(f"States were invalid: {shares} of the cycles.")
     elif run.invalid and not any(run.invalid):
         sentences.append("The states of all joints were valid in every cycle.")
-    unreached = list(find_unreached_goals(loop, events.goals, ran_ns))
+    unreached = list(find_unreached_goals(loop, events.goals, ran_ns)) if events.goals else []
+    if events.goals is None and any(command.goal for command in loop.commands):
+        read = f"; dxlrun analyze {run.log} reads it from the log" if run.log else ""
+        sentences.append(
+            f"Whether the motions reached their goals is unknown: the loop did not say so{read}."
+        )
     sentences += [f"{'; '.join(filter(None, (one.sentence, one.remedy)))}." for one in unreached[:_MOST]]
     if often or run.skipped or any(one.code in _SLOW_REPLIES for one in errors):
         sentences[:0] = filter(None, (run.describe_machine(plan),))
