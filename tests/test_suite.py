@@ -10,6 +10,7 @@ import sys
 import tarfile
 import tomllib
 import zipfile
+from collections.abc import Iterable, Iterator
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -95,6 +96,86 @@ def test_deadlines_are_in_the_kit() -> None:
 )
 def test_deadline_is_found(source: str) -> None:
     assert deadlines(source) == [1]
+
+
+CHECKING = re.compile(r"(?:^|_)(?:assert|check|require|judge|raises|warns|fail|until|replayed)(?:_|$)")
+FILLED = {"range", "np.linspace", "itertools.count", "count"}
+"""Calls whose result always has something in it."""
+
+
+def is_full(node: ast.AST, known: set[str]) -> bool:
+    """Check whether an expression surely has something in it: a literal, a constant, or what is known."""
+    full = False
+    match node:
+        case ast.Name() | ast.Attribute():
+            name = ast.unparse(node)
+            full = name in known or name.rpartition(".")[2][0].isupper()
+        case ast.Constant():
+            full = bool(node.value)
+        case ast.Dict():
+            full = bool(node.keys)
+        case ast.Starred() | ast.Subscript():
+            full = is_full(node.value, known)
+        case ast.BinOp():
+            full = is_full(node.left, known) or is_full(node.right, known)
+        case ast.Tuple() | ast.List() | ast.Set():
+            full = any(not isinstance(one, ast.Starred) or is_full(one, known) for one in node.elts)
+        case ast.ListComp() | ast.GeneratorExp() | ast.SetComp() | ast.DictComp():
+            full = all(not one.ifs and is_full(one.iter, known) for one in node.generators)
+        case ast.Call():
+            parts = [*node.args, *ast.iter_child_nodes(node.func)]  # `items` of what?
+            full = ast.unparse(node.func) in FILLED or any(is_full(one, known) for one in parts)
+    return full
+
+
+def unseen_loops(source: str) -> Iterator[str]:
+    """Yield the tests that check only in loops over what may be empty, with the line of the first loop."""
+    for test in ast.walk(ast.parse(source)):
+        if not isinstance(test, ast.FunctionDef) or not test.name.startswith("test"):
+            continue
+        known = {one.arg for one in test.args.args}
+        loops: list[ast.For | None] = []
+
+        def visit(nodes: Iterable[ast.AST], unseen: ast.For | None, known: set[str], loops: list) -> None:
+            for node in nodes:
+                if isinstance(node, ast.Assign | ast.AnnAssign) and node.value and is_full(node.value, known):
+                    targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+                    known.update(map(ast.unparse, targets))
+                called = ast.unparse(node.func) if isinstance(node, ast.Call) else ""
+                if isinstance(node, ast.Assert) or CHECKING.search(called.rpartition(".")[2]):
+                    loops.append(unseen)
+                    named = [one for one in ast.walk(node) if isinstance(one, ast.Name | ast.Attribute)]
+                    known.update(map(ast.unparse, named))
+                empty = isinstance(node, ast.For) and not is_full(node.iter, known)
+                visit(ast.iter_child_nodes(node), unseen or (node if empty else None), known, loops)
+
+        visit(test.body, None, known, loops)
+        if loops and all(loops):
+            yield f"{loops[0].lineno} {test.name}"
+
+
+def test_loops_with_assertions_show_that_they_ran() -> None:
+    """Write `assert found` before `for one in found`: a loop over nothing checks nothing."""
+    texts = {path: path.read_text() for path in ROOT.glob("tests/**/test_*.py")}
+    found = [
+        f"{path.relative_to(ROOT)}:{loop}" for path, text in texts.items() for loop in unseen_loops(text)
+    ]
+    assert found == []
+
+
+@pytest.mark.parametrize(
+    ("body", "found"),
+    [
+        ("for one in found():\n        assert one", ["2 test_made_up"]),
+        ("rows = found()\n    for one in rows:\n        assert one", ["3 test_made_up"]),
+        ("rows = found()\n    assert rows\n    for one in rows:\n        assert one", []),
+        ("for one in (1, 2):\n        assert one", []),
+        ("for one in found():\n        assert one\n    assert two", []),
+        ("for one in given:\n        assert one", []),
+    ],
+)
+def test_loop_that_may_be_empty_is_found(body: str, found: list[str]) -> None:
+    assert [*unseen_loops(f"def test_made_up(given):\n    {body}\n")] == found
 
 
 def test_packages_that_the_import_linter_does_not_see_import_only_the_faces() -> None:

@@ -100,6 +100,7 @@ def test_renamed_option_names_the_new_one(every_option: list[Option], dxlrun: Ca
     known = {(option.verb, name) for option in every_option for name in option.names}
     places = {"servo": ["/dev/none", "1", "get"], "teach": ["new.yaml"], "frames": ["robot.yaml"]}
     for verb, words in verb_registry.RENAMED.items():
+        assert words
         for old, new in words.items():
             assert (verb, old) not in known
             assert (verb, new.split()[0]) in known

@@ -36,6 +36,7 @@ def test_property_with_a_column_is_in_json_and_table(monkeypatch: pytest.MonkeyP
 def test_limit_of_the_servo_is_marked_in_the_table() -> None:
     rows, table = _joint_table()
     column = [one.name for one in table.columns].index("velocity")
+    assert rows
     for row, cells in zip(rows, table.rows, strict=True):
         assert cells[column].text.endswith("(servo)") == (row["velocity_source"] == "servo")
 

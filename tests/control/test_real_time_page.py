@@ -35,6 +35,7 @@ def test_every_policy_for_late_cycles_is_on_the_page():
 
 
 def test_every_request_is_on_the_page():
+    assert Scheduler.model_fields
     for key in Scheduler.model_fields:
         assert f"`{key}`" in PAGE, key
 

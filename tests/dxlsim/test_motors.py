@@ -145,6 +145,7 @@ def rise_s(part: Way, dt: float) -> float:
 @both
 @four
 def test_rise_times_are_within_15_percent_of_the_identified_servo(model, parameters):
+    assert BENCH[model].steps
     for degrees in BENCH[model].steps:
         servo, mechanics = simulated(model)
         angles, goal = move(servo, mechanics, START + math.radians(degrees), 1.0)
@@ -220,6 +221,7 @@ def test_time_constant_and_gain_are_those_that_were_identified(model):
 
 
 def test_models_that_nothing_was_published_of_keep_the_manual_s_figures_marked_so():
+    assert all_tables()
     for table in all_tables():
         motor, identified = motor_of(table), table.model.partition("-FW")[0] in BENCH
         assert motor.source.startswith("[i] scaled from the ") != identified, table.model

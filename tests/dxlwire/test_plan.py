@@ -71,6 +71,7 @@ def test_torque_off_takes_a_broadcast_and_two_requests_of_each_servo():
 
 def test_limits_become_ticks_inside_them():
     plan = make_plan((1, 2), lower=-1.0, upper=0.5)
+    assert len(plan.servos) == 2
     for servo in plan.servos:
         ends = sorted((servo.joint_position(servo.lower_tick), servo.joint_position(servo.upper_tick)))
         assert ends[0] >= -1.0

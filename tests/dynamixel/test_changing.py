@@ -119,6 +119,7 @@ def test_a_lost_acknowledgement_of_an_id_decides_nothing(rig):
 def test_every_rate_of_the_table_can_be_set(model, protocol):
     rig = Rig(model, protocol)
     before = RATE
+    assert rig.one.table.baud_rates
     for rate in rig.one.table.baud_rates.values():
         assert rig.one.change_rate(rate) == f"runs at {rate} bit/s (before: {before})"
         assert rig.servo.baud_rate == pytest.approx(rate, rel=0.03)

@@ -98,6 +98,7 @@ def another_value(item: ControlItem, start: int) -> int:
 
 @every_table
 def test_every_item_that_can_be_written_has_a_judgement_with_a_reason(table):
+    assert table.items
     for item in table.items.values():
         if item.access == "R":
             assert item.deviation is None, item.name

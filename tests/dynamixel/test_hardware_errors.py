@@ -125,6 +125,7 @@ def test_bits_and_codes_are_those_of_the_manual(model):
 
 @reporting
 def test_each_error_refuses_the_start_by_its_name(table):
+    assert table.errors.values
     for name, value in table.errors.values.items():
         rig = rig_of(table, (1,))
         rig.stick(1, table.errors.item, value)

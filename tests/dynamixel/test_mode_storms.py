@@ -93,6 +93,7 @@ def test_servo_gets_only_goals_of_its_mode_which_is_known_after_the_storm(name, 
     rig = storm(name, chance)
     out = (EventCode.SERVO_LIMP, EventCode.SERVO_LOST, EventCode.SERVO_REBOOTED)
     excused = {source for code in out for source, _ in rig.events.of(code)}
+    assert rig.plans[0].servos
     for servo in rig.plans[0].servos:
         registers = rig.servo(servo.servo_id).registers
         found = {value.name: registers[value.name] for mode in servo.modes for value in mode.operating}

@@ -189,7 +189,9 @@ def others(table):
 
 @pytest.mark.parametrize("protocol", [1.0, 2.0])
 def test_whatever_may_be_declared_of_any_model_is_written_once_and_then_there(protocol):
-    for table in [table for table in all_tables() if table.protocol == protocol]:
+    tables = [table for table in all_tables() if table.protocol == protocol]
+    assert tables
+    for table in tables:
         plan = make_plan((5,), protocol=protocol, model=table.model, reference=1.5, lower=-0.1, upper=0.1)
         wanted = tuple(sorted(others(table), key=lambda one: not one.eeprom))
         plan = replace(plan, servos=(replace(plan.servos[0], settings=wanted),))

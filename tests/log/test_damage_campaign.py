@@ -116,7 +116,7 @@ def test_a_log_that_is_cut_at_any_byte_is_read_up_to_its_last_whole_chunk(
 ) -> None:
     first = written.data.index(b"dxlrun_msgs")  # before it there is no header yet
     every = range(len(written.data))
-    for size in every if amount >= len(every) else chance.sample(every, int(amount)):
+    for size in chance.sample(every, min(int(amount), len(every))):
         found = read(tmp_path / "cut.mcap", written.data[:size])
         whole = sum(end <= size for end in written.ends)
         if found is None:

@@ -116,6 +116,7 @@ def test_poses_of_logged_frames_are_those_of_pinocchio(
             )
         pin.framesForwardKinematics(model, data, q)
         found = still | transforms(scene.at(positions))
+        assert urdf.links
         for link in urdf.links:
             expected = data.oMf[model.getFrameId(link, pin.BODY)].homogeneous
             assert np.abs(in_root(link, found) - expected).max() < 1e-9, (link, positions)
@@ -237,7 +238,9 @@ def test_quaternions_are_of_length_one_and_never_change_their_sign_at_once() -> 
         jump = 2 * math.pi * (number // 100)  # a servo that counts its turns anew
         sign = -1.0 if number % 3 else 1.0  # a filter may return either quaternion of a rotation
         turn = sign * Rotation.from_euler("xyz", [angle, 0.3, -angle]).as_quat()
-        for each in scene.at({"head_yaw_joint": angle - jump}, tuple(turn)).transforms:
+        found = scene.at({"head_yaw_joint": angle - jump}, tuple(turn)).transforms
+        assert found
+        for each in found:
             rotation = each.transform.rotation
             quaternion = np.array([rotation.x, rotation.y, rotation.z, rotation.w])
             assert np.linalg.norm(quaternion) == pytest.approx(1, abs=1e-12)

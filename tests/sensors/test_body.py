@@ -77,6 +77,7 @@ def test_pose_rate_and_acceleration_are_what_mujocos_sensors_measure(urdf):
         data.qfrc_applied[:] = generator.uniform(-2, 2, model.nv)
         mujoco.mj_forward(model, data)
         body.set_shafts(Shafts(0, data.qpos.copy(), data.qvel.copy(), data.qacc.copy()))
+        assert links
         for link in links:
             motion = body.motion(link)
             sensed = {kind: data.sensor(f"{kind} {link}").data for kind in kinds}

@@ -51,6 +51,7 @@ def test_missing_and_late_replies_are_those_of_the_part_that_fails(
     case: Case, amount: int, tmp_path: Path
 ) -> None:
     """`amount` is the number of robots."""
+    assert case.robots
     for robot in case.robots[:amount]:
         check(case, robot, tmp_path)
 

@@ -69,6 +69,7 @@ def test_poses_of_frames_are_those_of_pinocchio(text: str, amount: float, chance
             else:
                 q[place.idx_q] = position
         pin.framesForwardKinematics(model, data, q)
+        assert urdf.links
         for link in urdf.links:
             expected = data.oMf[model.getFrameId(link, pin.BODY)].homogeneous
             found = np.array(tree.pose(link, positions=positions).matrix)

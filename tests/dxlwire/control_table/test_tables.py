@@ -44,6 +44,7 @@ def test_no_two_items_share_a_byte(table: ControlTable) -> None:
 
 @every_table
 def test_every_end_of_a_range_and_initial_value_can_be_written_and_read_back(table: ControlTable) -> None:
+    assert table.items
     for item in table.items.values():
         ends = (item.minimum, item.maximum) if item.encoding != "sign_magnitude" else (0, 1023, -1023)
         for ticks in ends:
@@ -111,6 +112,7 @@ def test_the_newest_firmware_comes_first_and_has_the_plain_name() -> None:
 
 @pytest.mark.parametrize("table", [each for each in TABLES if each.protocol == 1.0], ids=_id)
 def test_protocol_1_baud_rates_follow_the_formula_of_the_manual(table: ControlTable) -> None:
+    assert table.baud_rates
     for value, rate in table.baud_rates.items():
         if value < 250:
             assert Fraction(2_000_000, value + 1) == pytest.approx(rate, rel=0.03)
