@@ -16,7 +16,6 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -45,8 +44,8 @@ from dxlrun.messages.cdr import Codec
 from dxlrun.messages.declared import declared_message
 from dxlrun.plan.loop_plan import ControllerPlan
 from dxlrun.run.kept_files import read_states, replace_file, state_directory
-from dxlrun.testing import VirtualRobot, plan_of, read_log, simulated_robot
-from dxlrun_analysis.replay import replay_log
+from dxlrun.testing import plan_of, read_log, simulated_robot
+from dxlrun_analysis.replay import Setting, replay_log
 
 ROBOT = """\
 name: keeper
@@ -129,15 +128,11 @@ def robot(tmp_path, installed, monkeypatch):
     return path
 
 
-def run(robot: Path, kept: Path | None, log: Path | None = None, **arguments: str) -> VirtualRobot:
+def run(robot: Path, kept: Path | None, log: Path | None = None, **arguments: str) -> int:
+    """Return which run it was, by what its controller commanded."""
     made = simulated_robot(robot, arguments=arguments, duration_s=0.05, log=log, kept=kept)
     assert made.run().detail == ""
     assert made.unkept == ()
-    return made
-
-
-def number(made: VirtualRobot) -> int:
-    """Return which run it was, by what it commanded."""
     return round(float(made.record.goals.position[0]) * 100)
 
 
@@ -147,9 +142,9 @@ def said(log: Path) -> list[tuple[int, str]]:
 
 def test_a_state_goes_from_run_to_run_and_a_replay_begins_with_it(robot, tmp_path):
     kept, log = tmp_path / "kept", tmp_path / "run.mcap"
-    assert [number(run(robot, kept)) for _ in range(3)] == [0, 1, 2]
+    assert [run(robot, kept) for _ in range(3)] == [0, 1, 2]
     assert [path.name for path in kept.iterdir()] == ["runs.kept"]
-    assert number(run(robot, kept, log)) == 3
+    assert run(robot, kept, log) == 3
     ((severity, text),) = said(log)
     assert severity == Severity.INFO
     assert text == f"starts with its kept state of 20008 bytes ({kept}/runs.kept)"
@@ -157,26 +152,16 @@ def test_a_state_goes_from_run_to_run_and_a_replay_begins_with_it(robot, tmp_pat
     report = replay_log(log)
     assert report.same, report
     assert report.messages >= 4, "the pieces that left are compared"
-    assert number(run(robot, kept)) == 0, "to delete the file is to forget"
+    assert run(robot, kept) == 0, "to delete the file is to forget"
 
 
-def test_a_replay_compares_what_left(robot, tmp_path):
+def test_a_replay_compares_what_left_also_of_a_run_that_keeps_nothing(robot, tmp_path):
     log = tmp_path / "run.mcap"
-    run(robot, None, log)
-    report = replay_log(log, [_size(19999)])
+    assert [run(robot, None), run(robot, None, log)] == [0, 0]
+    report = replay_log(log, [Setting("runs", ("size",), 19999)])
     assert not report.same
     assert report.first is not None
     assert report.first.what.startswith("message of /kept")
-
-
-def _size(size: int) -> Any:
-    from dxlrun_analysis.replay import Setting
-
-    return Setting("runs", ("size",), size)
-
-
-def test_without_a_directory_nothing_is_kept(robot):
-    assert [number(run(robot, None)) for _ in range(2)] == [0, 0]
 
 
 @pytest.mark.parametrize(
@@ -189,9 +174,9 @@ def test_without_a_directory_nothing_is_kept(robot):
 def test_another_servo_begins_anew_and_says_why(robot, tmp_path, change, why):
     kept, log = tmp_path / "kept", tmp_path / "run.mcap"
     run(robot, kept)
-    assert number(run(robot, kept, log, **change)) == 0
+    assert run(robot, kept, log, **change) == 0
     assert said(log) == [(Severity.WARNING, f"starts without its kept state: {why} ({kept}/runs.kept)")]
-    assert number(run(robot, kept, **change)) == 1, "its own state has taken the place"
+    assert run(robot, kept, **change) == 1, "its own state has taken the place"
 
 
 def test_simulated_and_real_servos_do_not_share_a_state(robot, tmp_path):
@@ -220,40 +205,35 @@ def test_no_home_directory_keeps_nothing(robot, monkeypatch):
     assert state_directory(plan_of(robot)) is None
 
 
-def damaged(data: bytes) -> dict[str, tuple[bytes, str]]:
-    middle = len(data) // 2
-    foreign = b"".join(file_pieces("another", b"state", {})[1])
-    return {
-        "empty": (b"", "is not a state of a controller, or was saved by another version"),
-        "cut": (data[:-1], "is damaged or incomplete"),
-        "half": (data[:middle], "is damaged or incomplete"),
-        "torn": (data[:middle] + bytes(len(data) - middle), "is damaged or incomplete"),
-        "one bit": (
-            data[:middle] + bytes([data[middle] ^ 4]) + data[middle + 1 :],
-            "is damaged or incomplete",
-        ),
-        "longer": (data + b"x", "is damaged or incomplete"),
-        "too long": (bytes(LONGEST_FILE + 1), f"is longer than {LONGEST_FILE} bytes"),
-        "noise": (
-            random.Random(1).randbytes(5000),
-            "is not a state of a controller, or was saved by another version",
-        ),
-        "version": (
-            data.replace(b"state 1", b"state 2"),
-            "is not a state of a controller, or was saved by another version",
-        ),
-        "foreign": (foreign, "belongs to another controller, another"),
-    }
+DAMAGED, FOREIGN = (
+    "is damaged or incomplete",
+    "is not a state of a controller, or was saved by another version",
+)
+DAMAGES = {
+    "empty": (lambda data: b"", FOREIGN),
+    "cut": (lambda data: data[:-1], DAMAGED),
+    "half": (lambda data: data[: len(data) // 2], DAMAGED),
+    "torn": (lambda data: data[: len(data) // 2].ljust(len(data), b"\0"), DAMAGED),
+    "one bit": (lambda data: data[:9000] + bytes([data[9000] ^ 4]) + data[9001:], DAMAGED),
+    "longer": (lambda data: data + b"x", DAMAGED),
+    "too long": (lambda data: bytes(LONGEST_FILE + 1), f"is longer than {LONGEST_FILE} bytes"),
+    "noise": (lambda data: random.Random(1).randbytes(5000), FOREIGN),
+    "version": (lambda data: data.replace(b"state 1", b"state 2"), FOREIGN),
+    "foreign": (
+        lambda data: b"".join(file_pieces("another", b"state", {})[1]),
+        "belongs to another controller, another",
+    ),
+}
 
 
-@pytest.mark.parametrize("how", list(damaged(bytes(100))))
+@pytest.mark.parametrize("how", DAMAGES)
 def test_a_file_that_cannot_be_used_is_left_out_with_one_event(robot, tmp_path, how):
     kept, log = tmp_path / "kept", tmp_path / "run.mcap"
     run(robot, kept)
     place = kept / "runs.kept"
-    data, why = damaged(place.read_bytes())[how]
-    place.write_bytes(data)
-    assert number(run(robot, kept, log)) == 0
+    damage, why = DAMAGES[how]
+    place.write_bytes(damage(place.read_bytes()))
+    assert run(robot, kept, log) == 0
     assert said(log) == [
         (Severity.WARNING, f"starts without its kept state: the state's file {why} ({place})")
     ]
@@ -264,7 +244,7 @@ def test_what_is_no_file_does_not_block_the_start(robot, tmp_path):
     kept, log = tmp_path / "kept", tmp_path / "run.mcap"
     kept.mkdir()
     os.mkfifo(kept / "runs.kept")
-    assert number(run(robot, kept, log)) == 0
+    assert run(robot, kept, log) == 0
     ((_, text),) = said(log)
     assert "the state's path is not a regular file" in text
 
@@ -283,15 +263,18 @@ def test_a_full_disk_leaves_the_old_file_and_says_so(robot, tmp_path):
     assert made.unkept == (f"the last state of runs was not saved in {kept}: {os.strerror(errno.EFBIG)}",)
     assert (kept / "runs.kept").read_bytes() == before
     assert [path.name for path in kept.iterdir()] == ["runs.kept"]
-    assert number(run(robot, kept)) == 1
+    assert run(robot, kept) == 1
 
 
 # What leaves the loop
 
 
-class _Sink:
-    def __init__(self) -> None:
+class Keeping(StateKeeper):
+    """Keeps the messages that leave; without events."""
+
+    def __init__(self, states: KeptStates | None = None) -> None:
         self.messages: list[bytes] = []
+        super().__init__(states or KeptStates(), TopicLog(CycleRecord(CycleLayout((), ())), self), self)
 
     def announce(self, topic: object) -> int:
         return 0
@@ -299,19 +282,16 @@ class _Sink:
     def message(self, topic: int, t_ns: int, data: bytes) -> None:
         self.messages.append(data)
 
-
-class _Events:
     def emit_event(self, source: str, event: EventBody, data: bytes = b"") -> None:
         """Forget it."""
+
+    def keep_as(self, name: str):
+        """Return what keeps a state of a controller."""
+        return self.open_state(controller(name), {})[1]
 
 
 def controller(name: str) -> ControllerPlan:
     return ControllerPlan(name, "type", "", "{}", (), (), (), True, 1)
-
-
-def keeping(sink: _Sink, states: KeptStates | None = None) -> StateKeeper:
-    record = CycleRecord(CycleLayout((), ()))
-    return StateKeeper(states or KeptStates(), TopicLog(record, sink), _Events())
 
 
 def files_of(messages: list[bytes]) -> list[tuple[str, bytes]]:
@@ -320,9 +300,8 @@ def files_of(messages: list[bytes]) -> list[tuple[str, bytes]]:
 
 
 def test_one_piece_leaves_a_cycle_and_the_newest_state_that_waits():
-    sink = _Sink()
-    leaving = keeping(sink)
-    (_, keep), (_, other) = leaving.open_state(controller("a"), {}), leaving.open_state(controller("b"), {})
+    leaving = Keeping()
+    keep, other = leaving.keep_as("a"), leaving.keep_as("b")
     state = np.random.default_rng(1).bytes(3 * PIECE + 1)
     keep(state)
     leaving.publish_next()
@@ -331,37 +310,35 @@ def test_one_piece_leaves_a_cycle_and_the_newest_state_that_waits():
     other(b"")
     for cycle in range(2, 60):
         leaving.publish_next()
-        assert len(sink.messages) <= cycle
-        assert all(len(data) < PIECE + 200 for data in sink.messages)
-    files = [(name, opened_file(data, name)[0]) for name, data in files_of(sink.messages)]
+        assert len(leaving.messages) <= cycle
+        assert all(len(data) < PIECE + 200 for data in leaving.messages)
+    files = [(name, opened_file(data, name)[0]) for name, data in files_of(leaving.messages)]
     assert files == [("a", state), ("a", b"newest"), ("b", b"")]
 
 
 def test_at_the_end_everything_leaves_at_once():
-    sink = _Sink()
-    leaving = keeping(sink)
-    _, keep = leaving.open_state(controller("a"), {})
+    leaving = Keeping()
+    keep = leaving.keep_as("a")
     keep(bytes(MOST_KEPT))
     leaving.publish_next()
     keep(b"last")
     leaving.publish_remaining()
-    assert [len(opened_file(data, "a")[0]) for _, data in files_of(sink.messages)] == [MOST_KEPT, 4]
+    assert [len(opened_file(data, "a")[0]) for _, data in files_of(leaving.messages)] == [MOST_KEPT, 4]
 
 
 @pytest.mark.parametrize("lost", range(6))
 def test_a_file_with_a_lost_piece_is_left_out(lost):
-    sink = _Sink()
-    leaving = keeping(sink)
-    _, keep = leaving.open_state(controller("a"), {})
+    leaving = Keeping()
+    keep = leaving.keep_as("a")
     for state in (bytes(3 * PIECE + 1), b"next"):
         keep(state)
         leaving.publish_remaining()
-    del sink.messages[lost]
-    assert [opened_file(data, "a")[0] for _, data in files_of(sink.messages)] == [b"next"]
+    del leaving.messages[lost]
+    assert [opened_file(data, "a")[0] for _, data in files_of(leaving.messages)] == [b"next"]
 
 
 def test_a_controller_that_comes_again_has_what_it_kept_last():
-    leaving = keeping(_Sink(), KeptStates({"a": KeptFile("a.kept", problem="its file is damaged")}))
+    leaving = Keeping(KeptStates({"a": KeptFile("a.kept", problem="its file is damaged")}))
     found, keep = leaving.open_state(controller("a"), {})
     assert found == b""
     keep(b"newest")
@@ -378,7 +355,7 @@ def test_a_controller_that_comes_again_has_what_it_kept_last():
     ],
 )
 def test_what_cannot_be_kept_is_the_controllers_fault(state, why):
-    _, keep = keeping(_Sink()).open_state(controller("a"), {})
+    keep = Keeping().keep_as("a")
     with pytest.raises(ControllerFault, match=why):
         keep(state)
 

@@ -1,0 +1,243 @@
+"""Robots on virtual time by stories in text: what a client asks, what fails, and how goals and shafts end.
+
+A text is a robot file, or a line with the name of one in `robots`; after `----` a motion for it,
+and after `====` cases. A case is a sentence and lines:
+
+    A jammed joint misses its goal
+      run 3 s leader_torque:=off       duration, and arguments of the robot file
+      id: 1, => id: 1, tolerance: 8 deg,
+      play                             the motion of this text, or one of `robots/motions`
+      jam servo=2 at=500ms             a fault, as `dxlrun --fault` has it
+      hand servo=2 by=-30 at=1300ms    a hand turns a shaft by degrees at once, against the servo
+      at 0.2 arm trajectory {points: [{time: 1, positions: [0.7, 0]}]}
+      at 0.9 cancel {controller: arm}
+      => goal arm missed joint grip is...
+      => shaft 2 at 2.9: 10 to 20 deg
+
+Expected are each goal that ends, events (`=> event arm turns...`, source and text, or `=> no event arm ...`),
+shafts, deg from the reference, and columns of the log: `=> position elbow from 1.5 to 2: 0.29 to 0.31`, with
+`spread` before the numbers for the difference of the largest and the smallest one, and `step` for the largest
+one of neighbours. Without a time it is the last cycle. `...` stands for any text. Each run is equal to its
+replay. A case may have several runs: `NAME = a | b` lines let `NAME` stand for one text after the other.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Iterable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from tests.kit.clients import Ask, Client
+from tests.kit.line_faults import turn_by_hand
+
+from dxlrun.channels.answers import Completion
+from dxlrun.channels.event_records import EventCode
+from dxlrun.log.log_reader import Log, read_log
+from dxlrun.testing import VirtualRobot, simulated_robot
+from dxlrun_analysis.replay import replay_log
+from dxlsim.bus.simulated_bus import SimulatedBus
+from dxlsim.faults.fault import parse_fault
+from dxlsim.faults.kinds import KINDS
+from dxlsim.faults.script import FaultScript
+from dxlsim.servo.simulated_servo import SimulatedServo
+
+ROBOTS = Path(__file__).parents[2] / "robots"
+LOOK_NS = 10_000_000
+WHERE = r"(?: at (?P<at>[\d.]+)| from (?P<begin>[\d.]+) to (?P<end>[\d.]+))?"
+NUMBERS = r": (?:(?P<spread>spread|step) )?(?P<low>[-\d.]+|nan)(?: to (?P<high>[-\d.]+))?(?: deg)?"
+MEASURED = re.compile(rf"(?P<column>\w+) (?P<name>[\w./]+){WHERE}{NUMBERS}$")
+
+
+class Story:
+    """One case: what is asked before the run, and what is expected after it."""
+
+    def __init__(self, folder: Path, text: Path, robot: str, motion: str, shafts: Iterable[int]) -> None:
+        self.folder, self.beside, self.robot, self.motion = folder, text.parent, robot, motion
+        self.seconds, self.arguments = 0.0, dict[str, str]()
+        self.play, self.asks, self.faults = list[Path](), list[Ask](), list[Any]()
+        self.hands: list[tuple[int, float, int]] = []
+        self.goals: list[dict[str, Any]] = []
+        self.shafts: dict[int, list[float]] = {number: [] for number in shafts}
+
+    def tell(self, line: str) -> None:
+        """Take a line of what happens."""
+        word, _, rest = line.partition(" ")
+        if " => " in line:
+            old, _, new = line.partition(" => ")
+            new = new.replace("\\n", "\n")
+            assert old in self.robot + self.motion, f"robot and motion lack {old!r}"
+            self.robot, self.motion = self.robot.replace(old, new), self.motion.replace(old, new)
+        elif word == "run":
+            seconds, _, *arguments = rest.split()
+            self.seconds, self.arguments = float(seconds), dict(one.split(":=") for one in arguments)
+        elif word == "play":
+            own = self.folder / "own_motion.yaml"
+            own.write_text(self.motion)
+            self.play.append(ROBOTS / "motions" / rest if rest else own)
+        elif word == "hand":
+            match = re.fullmatch(r"servo=(\d+) by=([-\d.]+) at=(\d+)ms", rest)
+            assert match, "write hand servo=ID by=DEGREES at=TIMEms"
+            servo, by, ms = match.groups()
+            self.hands.append((int(servo), math.radians(float(by)), int(ms) * 1_000_000))
+        elif word in KINDS:
+            self.faults.append(parse_fault(line))
+        else:
+            self.ask(line)
+
+    def ask(self, line: str) -> None:
+        match = re.match(r"at ([\d.]+) (?:(\w+) )?(\w+) (\{.*\})$", line)
+        assert match, "this line is no request, fault, change, `run` or `play`"
+        at, controller, kind, values = match.groups()
+        self.asks.append(Ask(float(at), controller or "", kind, yaml.safe_load(values)))
+
+    def perform(self) -> None:
+        """Run, compare with the replay, and keep the log and where the shafts were."""
+        for beside in (*ROBOTS.iterdir(), *self.beside.iterdir()):
+            (self.folder / beside.name).symlink_to(beside)
+        file, path = self.folder / "own.yaml", self.folder / "run.mcap"
+        file.write_text(self.robot)
+        options: dict[str, Any] = {"arguments": self.arguments, "play": self.play, "log": path}
+        robot = simulated_robot(file, duration_s=self.seconds, **options)
+        client = robot.robot.loop.steering.inbox = Client(robot, self.asks)
+        FaultScript(self.faults).attach(robot.buses)
+        for number, by, at_ns in self.hands:
+            servo = robot.buses[0].servo(number)
+            robot.buses[0].at(at_ns, partial(self._turn, servo, by))
+        self._watch(robot)
+        self.result, self.virtual = robot.run(), robot
+        assert all(isinstance(answer, Completion) for answer in client.answers.values()), client.answers
+        assert replay_log(path).same
+        self.log: Log = read_log(path)
+        ended = [event for event in self.log.events if event.code == EventCode.GOAL_ENDED]
+        self.goals = [json.loads(event.data) for event in ended]
+
+    def _turn(self, servo: SimulatedServo, by: float) -> None:
+        turn_by_hand(servo, servo.shaft.angle + by)
+
+    def _watch(self, robot: VirtualRobot) -> None:
+        for bus in robot.buses:
+            for number in self.shafts:
+                look = partial(self._look, bus, number)
+                for t_ns in range(0, round(self.seconds * 1e9), LOOK_NS):
+                    bus.at(t_ns, look)
+
+    def _look(self, bus: SimulatedBus, number: int) -> None:
+        self.shafts[number].append(bus.servo(number).shaft_angle)
+
+    def expect(self, line: str) -> None:
+        """Check a line of what is expected."""
+        word, _, rest = line.partition(" ")
+        if word == "goal":
+            controller, status, *text = rest.split(" ", 2)
+            goal = next(one for one in self.goals if one["controller"] == controller)
+            self.goals.remove(goal)
+            assert goal["status"] == status, goal
+            assert not text or matches(goal["text"], text[0]), goal
+        elif word in ("event", "no"):
+            source, _, text = rest.removeprefix("event ").partition(" ")
+            texts = [event.text for event in self.log.events if event.source in (source, "runtime")]
+            assert any(matches(one, text) for one in texts) == (word == "event"), texts
+        elif word == "fails":
+            assert matches(f"{self.result.reason}, then {self.result.last}: {self.result.detail}", rest)
+            self.result = None
+        else:
+            match = MEASURED.match(line)
+            assert match, "this is neither a goal, an event, a shaft nor a column of the log"
+            found = self.values(match["column"], match["name"], match)
+            low, high = float(match["low"]), float(match["high"] or match["low"])
+            if match["spread"]:
+                found = np.array(
+                    [np.ptp(found) if match["spread"] == "spread" else np.abs(np.diff(found)).max()]
+                )
+            assert found.size
+            inside = [
+                low - 1e-9 <= one <= high + 1e-9 or (math.isnan(one) and math.isnan(low)) for one in found
+            ]
+            assert all(inside), (min(found), max(found))
+
+    def values(self, column: str, name: str, match: re.Match[str]) -> Any:
+        if column == "shaft":
+            rows = np.degrees(np.array(self.shafts[int(name)]) - self.middle(int(name)))
+            period_s = LOOK_NS * 1e-9
+        else:
+            names = self.log.joints if "/" not in name else self.virtual.record.layout.references
+            if column == "source_state":
+                names = [f"{one}/{state}" for one, each in self.log.header.sources.items() for state in each]
+            rows = self.log.cycles[column][:, list(names).index(name)]
+            period_s = self.virtual.plan.loop.period_ns * 1e-9
+        if match["begin"]:
+            return rows[round(float(match["begin"]) / period_s) : round(float(match["end"]) / period_s)]
+        return rows[[round(float(match["at"]) / period_s) if match["at"] else -1]]
+
+    def middle(self, number: int) -> float:
+        """Return the middle of a servo's turn, rad."""
+        plans = [servo for bus in self.virtual.plan.buses for servo in bus.servos]
+        return float(next(servo.reference for servo in plans if servo.servo_id == number))
+
+    def finish(self) -> None:
+        """Check that nothing ended which the story does not expect."""
+        assert not self.goals, self.goals
+        if self.result is not None:
+            assert (self.result.reason, self.result.detail) == ("ended", "")
+
+
+def matches(found: str, text: str) -> bool:
+    """Compare a text with one whose ends may be `...`."""
+    pattern = ".*".join(re.escape(part) for part in text.split("..."))
+    return re.fullmatch(pattern, found, re.DOTALL) is not None
+
+
+def stories(folder: Path) -> Iterator[Any]:
+    """Yield the cases of all texts in a folder, as parameters of a test: path, head, and numbered lines."""
+    for path in sorted(folder.glob("*.txt")):
+        head, _, body = path.read_text("utf-8").partition("====\n")
+        start = head.count("\n") + 2
+        for block in body.split("\n\n"):
+            lines = [(start + n, line.strip()) for n, line in enumerate(block.split("\n"))]
+            start += block.count("\n") + 2
+            (_, title), *told = [(n, line) for n, line in lines if line and line[0] != "#"]
+            for name, each in variants(told):
+                yield pytest.param(path, head, each, id=f"{path.stem}: {title}{name}")
+
+
+def variants(told: list[tuple[int, str]]) -> Iterator[tuple[str, list[tuple[int, str]]]]:
+    """Yield the lines of a case for each text that a name stands for."""
+    named = [re.match(r"([A-Z]+) = (.*)", line) for _, line in told]
+    name, texts = next((one.groups() for one in named if one), ("", ""))
+    if not name:
+        yield "", told
+        return
+    rest = [one for one, match in zip(told, named, strict=True) if not match]
+    for text in map(str.strip, texts.split(" | ")):
+        yield f" ({text})", [(number, line.replace(name, text)) for number, line in rest]
+
+
+def check_story(path: Path, head: str, lines: list[tuple[int, str]], folder: Path) -> None:
+    """Perform a story in an empty folder, and check what it expects; errors name file and line."""
+    robot, _, motion = head.partition("----\n")
+    if robot.strip().endswith(".yaml"):
+        robot = (ROBOTS / robot.strip()).read_text("utf-8")
+    shafts = {int(line.split()[2].rstrip(":")) for _, line in lines if line.startswith("=> shaft ")}
+    story = Story(folder, path, robot, motion, shafts)
+    performed = False
+    for number, line in lines:
+        try:
+            if not line.startswith("=> "):
+                story.tell(line)
+                continue
+            if not performed:
+                story.perform()
+            performed = True
+            story.expect(line.removeprefix("=> "))
+        except Exception as error:
+            error.add_note(f"{path}:{number}: {line}")
+            raise
+    assert performed, "the story expects nothing"
+    story.finish()
