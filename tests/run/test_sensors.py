@@ -24,6 +24,7 @@ import numpy as np
 import pytest
 from tests.kit.awaited import DEADLINE_S, until
 from tests.kit.campaigns import campaign
+from tests.kit.stories import plugin_folder
 
 from dxlrun.channels import slot
 from dxlrun.channels.child_processes import RunMemory
@@ -93,6 +94,12 @@ def unit():
     unit.close()
 
 
+def plan_with(folder: Path, sensors: str) -> Plan:
+    robot = folder / "one.yaml"
+    robot.write_text(ROBOT + sensors)
+    return plan_of(robot)
+
+
 def only_process(plan: Plan) -> PlannedProcess:
     """Return the process of the robot's only sensor."""
     (planned,) = planned_processes(plan.loop)
@@ -119,9 +126,7 @@ def sensor_of(run: Any, port: str) -> int | None:
 
 def test_a_sensor_that_dies_sends_nan_or_stops_and_comes_back(tmp_path, unit, monkeypatch):
     monkeypatch.setattr(supervisor, "_RESTART_S", 0.1)
-    robot = tmp_path / "one.yaml"
-    robot.write_text(ROBOT + SENSORS.format(port=unit.port))
-    plan = plan_of(robot)
+    plan = plan_with(tmp_path, SENSORS.format(port=unit.port))
     memory, record, events = create_memory(plan), CycleRecord(plan.loop.layout), []
 
     class Sink:
@@ -236,9 +241,7 @@ def test_a_sensor_that_dies_sends_nan_or_stops_costs_the_run_nothing_but_its_row
 
 def test_a_device_that_is_not_there_at_the_start_is_a_sentence(tmp_path):
     """The supervisor then ends the run, as for a port that is not there."""
-    robot = tmp_path / "pair.yaml"
-    robot.write_text(ROBOT + "sensors:\n  imu: {type: serial_imu, port: /dev/no_imu}\n")
-    plan = plan_of(robot)
+    plan = plan_with(tmp_path, "sensors:\n  imu: {type: serial_imu, port: /dev/no_imu}\n")
     memory = create_memory(plan)
     child = start_only(plan, memory)
     with pytest.raises(PortError, match=r"sensor imu cannot be opened: port /dev/no_imu not found; "):
@@ -275,19 +278,13 @@ def dxlrun_sensors():
 """
 
 
-def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str) -> Any:
-    """Return the plan of a robot with the sensor of a plug-in, as pip would install it."""
-    info = tmp_path / "stubborn-1.0.dist-info"
-    info.mkdir()
-    (tmp_path / "stubborn_sensors.py").write_text(text)
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: stubborn\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text("[dxlrun]\nstubborn = stubborn_sensors\n")
+def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str) -> Plan:
+    """Return the plan of a robot with the sensor of a plug-in."""
+    plugin_folder(tmp_path, "stubborn_sensors", text, "stubborn")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.delitem(sys.modules, "stubborn_sensors", raising=False)
-    robot = tmp_path / "one.yaml"
-    robot.write_text(ROBOT + "sensors:\n  sonar: {type: stubborn}\n")
-    return plan_of(robot)
+    return plan_with(tmp_path, "sensors:\n  sonar: {type: stubborn}\n")
 
 
 def test_a_driver_that_does_not_close_ends_also_without_a_supervisor(tmp_path, monkeypatch):

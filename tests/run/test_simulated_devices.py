@@ -10,6 +10,7 @@ from tests.kit.line_faults import other_host
 
 from dxlrun.cli import main
 from dxlrun.cli.sim import sim
+from dxlrun.errors import InputError
 from dxlrun.run.simulation_front import SimulationResult
 from dxlrun.testing import simulated_robot
 from dxlsim.messages import SimulationMessage
@@ -106,35 +107,6 @@ def test_boards_on_two_lines_are_told_apart(robot):
     assert values["imu/orientation.w"] == 1.0
 
 
-@pytest.mark.parametrize(
-    ("before", "after", "sentence"),
-    [
-        ("boards/mine.toml", "boards/yours.toml", "boards/yours.toml of mine cannot be read: No such file"),
-        ("toe: -3.5", "heel: -3.5", "mine has no state heel"),
-        ("halt: 1}}", "halt: 1}, noise: {toe: -1}}", "the noise of toe is negative; write a standard"),
-        ("toe: -3.5", "toe: heavy", "'heavy' is not a number; write a number in SI units"),
-        ("protocol: 2.0, baud", "protocol: 1.0, baud", "my-board of mine speaks Protocol 2.0, bus main"),
-    ],
-)
-def test_a_mistake_of_a_board_is_named(robot, before, after, sentence):
-    from dxlrun.errors import InputError
-
-    assert before in ROBOT
-    robot.write_text(ROBOT.replace(before, after, 1))
-    with pytest.raises(InputError) as error:
-        simulated_robot(robot)
-    assert sentence in str(error.value)
-    assert f"{robot}:" in str(error.value) or f"{robot.name}:" in str(error.value)
-
-
-def test_a_broken_table_is_named_at_the_robot_file(robot):
-    from dxlrun.errors import InputError
-
-    (robot.parent / "boards" / "mine.toml").write_text(BOARD.replace("bit = 5", "bit = 2"))
-    with pytest.raises(InputError, match="bit 2 of address 32 is defined twice; correct the file"):
-        simulated_robot(robot)
-
-
 URDF = """\
 <robot name="nodding">
   <link name="base"/><link name="head"/>
@@ -201,14 +173,34 @@ def test_dxlrun_sim_has_the_bodies_that_its_devices_are_on(tmp_path, monkeypatch
     assert served[0].sensed is not None
 
 
-def test_a_link_must_be_one_of_the_urdf(tmp_path):
-    from dxlrun.errors import InputError
+TWICE = "bit 2 of address 32 is defined twice; correct the file"
+NO_URDF = "imu is on link head, but the robot file has no URDF"
 
-    (tmp_path / "nodding.urdf").write_text(URDF)
-    path = tmp_path / "nodding.yaml"
-    path.write_text(ON_A_LINK.replace("link: head", "link: haed"))
-    with pytest.raises(InputError, match="link haed of imu is not in the URDF; did you mean head"):
-        simulated_robot(path)
-    path.write_text(ON_A_LINK.replace("model: {urdf: nodding.urdf}\n", ""))
-    with pytest.raises(InputError, match="imu is on link head, but the robot file has no URDF"):
-        simulated_robot(path)
+
+@pytest.mark.parametrize(
+    ("text", "before", "after", "sentence"),
+    [
+        (ROBOT, "boards/mine", "boards/yours", "boards/yours.toml of mine cannot be read: No such file"),
+        (ROBOT, "toe: -3.5", "heel: -3.5", "mine has no state heel"),
+        (ROBOT, "halt: 1}}", "halt: 1}, noise: {toe: -1}}", "the noise of toe is negative; write a standard"),
+        (ROBOT, "toe: -3.5", "toe: heavy", "'heavy' is not a number; write a number in SI units"),
+        (
+            ROBOT,
+            "protocol: 2.0, baud",
+            "protocol: 1.0, baud",
+            "my-board of mine speaks Protocol 2.0, bus main",
+        ),
+        (ROBOT, "boards/mine", "boards/twice", TWICE),
+        (ON_A_LINK, "link: head", "link: haed", "link haed of imu is not in the URDF; did you mean head"),
+        (ON_A_LINK, "model: {urdf: nodding.urdf}\n", "", NO_URDF),
+    ],
+)
+def test_a_mistake_of_a_board_is_named(robot, text, before, after, sentence):
+    assert before in text
+    (robot.parent / "nodding.urdf").write_text(URDF)
+    (robot.parent / "boards" / "twice.toml").write_text(BOARD.replace("bit = 5", "bit = 2"))
+    robot.write_text(text.replace(before, after, 1))
+    with pytest.raises(InputError) as error:
+        simulated_robot(robot)
+    assert sentence in str(error.value)
+    assert f"{robot.name}:" in str(error.value)

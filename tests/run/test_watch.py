@@ -476,63 +476,49 @@ def watched(tmp_path):
     return write_state
 
 
-@pytest.mark.parametrize("state", ["T", "t", "Z", "X"])
-def test_a_process_that_is_stopped_or_dead_is_silent_soon(watched, state):
-    signs = SignsOfLife(7, 100 * MS, 0, watched("S"))
-    watched(state)
+def without_entry(folder: Path) -> None:
+    (folder / "7/stat").unlink(missing_ok=True)
+
+
+def unreadable(folder: Path) -> None:
+    """Make the entry one that cannot be read, such as where no descriptor is left for it: EISDIR."""
+    without_entry(folder)
+    (folder / "7/stat").mkdir()
+
+
+LATE_NS = 5000 * MS
+
+
+@pytest.mark.parametrize(
+    ("change", "after_ns"),
+    [
+        *(pytest.param(state, HALTED_NS, id=f"{state}: stopped or dead") for state in "TtZX"),
+        *(pytest.param(state, LATE_NS, id=f"{state}: starved at most") for state in "RSD"),
+        pytest.param(6, HALTED_NS, id="its ID is that of another process"),
+        pytest.param(without_entry, HALTED_NS, id="it has no entry"),
+        pytest.param(unreadable, LATE_NS, id="its entry is unreadable"),
+        pytest.param(None, LATE_NS, id="its time of start is unknown"),
+    ],
+)
+def test_a_process_is_silent_soon_only_if_it_cannot_run(watched, change, after_ns):
+    folder = watched("S")
+    if change is None:
+        without_entry(folder)
+    signs = SignsOfLife(7, 100 * MS, 0, folder)
+    if isinstance(change, str):
+        watched(change)
+    elif isinstance(change, int):
+        watched("S", start_ticks=change)
+    elif change is not None:
+        change(folder)
+    times = range(0, 5300, 50)
     silent = []
-    for at_ms in range(0, 400, 50):
+    for at_ms in times:
         signs.record_beat("same", at_ms * MS)
-        silent.append(signs.is_silent(5000 * MS))
-    assert silent == [at_ms * MS > HALTED_NS for at_ms in range(0, 400, 50)]
-    signs.record_beat("beat", 400 * MS)
-    assert not signs.is_silent(5000 * MS)
-
-
-@pytest.mark.parametrize("state", ["R", "S", "D"])
-def test_a_starved_process_is_not_silent_before_its_timeout(watched, state):
-    signs = SignsOfLife(7, 100 * MS, 0, watched(state))
-    silent = []
-    for at_ms in range(0, 5200, 100):
-        signs.record_beat("same", at_ms * MS)
-        silent.append(signs.is_silent(5000 * MS))
-    assert silent == [False] * 51 + [True]
-
-
-def test_a_process_id_of_another_process_is_of_a_dead_one(watched):
-    signs = SignsOfLife(7, 1000 * MS, 0, watched("S", start_ticks=5))
-    watched("S", start_ticks=6)
-    for at_ms in (0, 300):
-        signs.record_beat("same", at_ms * MS)
-    assert signs.is_silent(5000 * MS)
-
-
-def test_an_unreadable_entry_is_not_a_dead_process(watched):
-    """Such as one with no descriptor left for it: only the timeout decides."""
-    signs = SignsOfLife(7, 1000 * MS, 0, watched("S"))
-    entry = watched("S") / "7/stat"
-    entry.unlink()
-    entry.mkdir()  # EISDIR
-    for at_ms in range(0, 5001, 500):
-        signs.record_beat("same", at_ms * MS)
-        assert not signs.is_silent(5000 * MS)
-    signs.record_beat("same", 5500 * MS)
-    assert signs.is_silent(5000 * MS)
-
-
-def test_a_process_without_an_entry_is_silent_soon(watched):
-    signs = SignsOfLife(7, 1000 * MS, 0, watched("S"))
-    (watched("S") / "7/stat").unlink()
-    for at_ms in (0, 300):
-        signs.record_beat("same", at_ms * MS)
-    assert signs.is_silent(5000 * MS)
-
-
-def test_a_process_whose_time_of_start_is_unknown_is_silent_after_its_timeout(tmp_path):
-    signs = SignsOfLife(7, 1000 * MS, 0, tmp_path)
-    for at_ms in (0, 1000, 2000):
-        signs.record_beat("same", at_ms * MS)
-    assert not signs.is_silent(5000 * MS)
+        silent.append(signs.is_silent(LATE_NS))
+    assert silent == [at_ms * MS > after_ns for at_ms in times]
+    signs.record_beat("beat", 5300 * MS)
+    assert not signs.is_silent(LATE_NS)
 
 
 def test_a_loop_that_nobody_looks_at_reads_the_process_table_ten_times_a_second(page, monkeypatch):
