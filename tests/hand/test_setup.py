@@ -1,4 +1,7 @@
-"""`dxlrun setup` with a scripted hand that connects simulated servos, on virtual time; and finding a port."""
+"""`dxlrun setup` with a scripted hand that connects simulated servos, on virtual time; and finding a port.
+
+Most of its dialogues are in dialogues/setup.txt.
+"""
 
 from __future__ import annotations
 
@@ -7,30 +10,26 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import pytest
+from tests.kit.dialogues import Told, check_dialogue, dialogues
 from tests.kit.hands import HandLine, Script, interrupt, written
 
 from dxlrun.description.reading import read_robot
 from dxlrun.dynamixel.tools.one_servo import OneServo
-from dxlrun.errors import InputError, PortError
+from dxlrun.errors import PortError
 from dxlrun_hand.commands.setup import set_up
 from dxlrun_hand.lines import find_port
 from dxlrun_hand.servo_setup import ServoSetup
 from dxlsim.simulation_plan import ServoConfig
 from dxlsim.virtual_ports import VirtualPorts
 
-ROBOT = """\
-name: arm
-arguments: {at: {default: /dev/null, help: port}}
-buses:
-  main: {port: "${at}", protocol: 2.0, baud_rate: 1000000, return_delay_time: 20 us, adapter: {latency: 0 s}}
-loop: {rate: 20}
-joint_defaults: {bus: main, reference: 0 deg, direction: 1}
-groups: {hand: {joints: [wrist]}}
-joints:
-  elbow: {id: 5, model: XL430-W250, registers: {temperature_limit: 70}}
-  wrist: {id: 1, model: XM430-W350, registers: {position_p_gain: 700}}
-"""
+TEXT = Path(__file__).parent / "dialogues" / "setup.txt"
+ROBOT = TEXT.read_text().partition("----\n")[0]
 NEW = (ServoConfig(1, "XL430-W250", math.radians(150)), ServoConfig(1, "XM430-W350", math.radians(200)))
+
+
+@pytest.mark.parametrize("told", [*dialogues(TEXT)])
+def test_dialogue(tmp_path: Path, capsys: pytest.CaptureFixture[str], told: Told) -> None:
+    check_dialogue(tmp_path, told, lambda: capsys.readouterr().err)
 
 
 class Bench:
@@ -62,113 +61,10 @@ class Bench:
         names = ("id", "baud_rate", "return_delay_time", "temperature_limit")
         return tuple(self.line.bus.servos[index].registers[name] for name in names)
 
-    @property
-    def writes(self) -> int:
-        return sum(data[:4] == b"\xff\xff\xfd\x00" and data[7] == 3 for data in self.line.heard)
-
 
 @pytest.fixture
 def bench(tmp_path: Path) -> Bench:
     return Bench(tmp_path)
-
-
-def test_new_servos_get_id_rate_and_registers_and_are_compared(bench: Bench) -> None:
-    script = bench.do(
-        ("Connect the servo for elbow (XL430-W250) alone to bus main", bench.connect(0)),
-        ("Connect the servo for wrist (XM430-W350) alone to bus main", bench.connect(1)),
-        ("Connect all servos of bus main", bench.connect(0, 1)),
-    )
-    assert bench.code == 0
-    assert bench.servo(0) == (5, 3, 10, 70)
-    assert bench.servo(1) == (1, 3, 10, 80)
-    assert bench.line.bus.servos[1].registers["position_p_gain"] != 700  # RAM: each run writes it
-    assert "elbow: has ID 5 (before: 1)" in script.text
-    assert "Bus main: 2 servos match the robot file." in script.text
-    again = Bench.do(
-        bench,
-        ("Connect the servo for elbow", bench.connect(0)),
-        ("Connect the servo for wrist", "s"),
-        ("Connect all", bench.connect(0, 1)),
-    )
-    assert "elbow: already matches the robot file" in again.text
-    assert bench.code == 0
-
-
-def refused(bench: Bench, connected: Callable[[], None], said: str) -> None:
-    """Connect something for the elbow that is refused; nothing is written."""
-    script = bench.do(
-        ("for elbow", connected),
-        ("for elbow", "s"),
-        ("Connect all", bench.connect(0)),
-        ("again?", ""),
-        joints=("elbow",),
-    )
-    assert said in script.text, script.text
-    assert bench.writes == 0
-    assert bench.code == 1
-    assert "elbow (ID 5 on bus main) does not answer at 1000000 bit/s" in script.text
-
-
-def test_two_servos_at_once_are_refused(bench: Bench) -> None:
-    bench.line.bus.servos[1].poke("id", 9)
-    refused(bench, bench.connect(0, 1), "Several servos answer (ID 1 at 57600 bit/s, ID 9 at 57600 bit/s)")
-
-
-def test_two_servos_at_two_rates_are_refused(bench: Bench) -> None:
-    bench.line.bus.servos[1].poke("baud_rate", 3)
-    refused(bench, bench.connect(0, 1), "Several servos answer (ID 1 at 1000000 bit/s, ID 1 at 57600 bit/s)")
-
-
-def test_two_servos_of_one_id_are_refused(tmp_path: Path) -> None:
-    bench = Bench(tmp_path, servos=(NEW[0], ServoConfig(1, "XL430-W250", math.radians(20))))
-    refused(bench, bench.connect(0, 1), "Two servos with the same ID seem to answer (ID 1 at 57600")
-
-
-def test_another_model_is_refused(bench: Bench) -> None:
-    refused(
-        bench,
-        bench.connect(1),
-        "ID 1 is XM430-W350, but elbow needs XL430-W250 in the robot file; connect",
-    )
-
-
-def test_no_servo_is_said_so(bench: Bench) -> None:
-    refused(bench, bench.connect(), "No servo answers at /dev/null; check its power and its cable.")
-
-
-def test_another_protocol_is_refused(tmp_path: Path) -> None:
-    bench = Bench(tmp_path)
-    bench.line = HandLine(ServoConfig(1, "MX-64", 1.0), protocol=1.0, rate=57_600)
-    bench.line.connect()
-    script = bench.do(
-        ("for elbow", bench.connect(0)), ("for elbow", "s"), ("all", ""), ("again", ""), joints=("elbow",)
-    )
-    assert "The servo uses Protocol 1.0, and bus main Protocol 2.0; connect another servo" in script.text
-
-
-def test_a_servo_at_any_rate_is_found(bench: Bench) -> None:
-    bench.line.bus.servos[0].poke("baud_rate", 4)
-    script = bench.do(("for elbow", bench.connect(0)), ("all", ""), joints=("elbow",))
-    assert "trying all others" in script.text
-    assert (bench.code, bench.servo(0)) == (0, (5, 3, 10, 70))
-
-
-def test_the_model_of_auto_is_that_of_the_servo(tmp_path: Path) -> None:
-    bench = Bench(tmp_path, ROBOT.replace("XL430-W250", "auto"))
-    script = bench.do(("for elbow (any model)", bench.connect(1)), ("all", ""), joints=("elbow",))
-    assert (bench.code, bench.servo(1)) == (0, (5, 3, 10, 70))
-    assert "the robot file." in script.text
-
-
-def test_what_changed_again_is_found_at_the_end(bench: Bench) -> None:
-    def spoiled() -> None:
-        bench.line.bus.servos[0].poke("temperature_limit", 60)
-        bench.line.bus.servos[0].poke("homing_offset", 5)
-
-    script = bench.do(("for elbow", bench.connect(0)), ("all", spoiled), ("again?", "n"), joints=("elbow",))
-    assert bench.code == 1
-    assert "elbow (ID 5 on bus main) has Temperature Limit (31) = 60, not 70" in script.text
-    assert "Homing Offset (20) = 5, and this value shifts every position" in script.text
 
 
 def test_a_servo_that_dies_in_the_middle_is_set_up_again(
@@ -187,23 +83,6 @@ def test_a_servo_that_dies_in_the_middle_is_set_up_again(
     )
     assert (bench.code, bench.servo(0)) == (0, (5, 3, 10, 70))
     assert "XL430-W250, ID 1 at 1000000 bit/s: did not answer" in script.text
-
-
-@pytest.mark.parametrize(
-    ("steps", "said"),
-    [
-        ([interrupt], "no servo was changed\n"),
-        ([(0,), interrupt], "set up: elbow; no other servo was changed\n"),
-        ([(0,), (1,), interrupt], "set up: elbow, wrist; no other servo was changed\n"),
-    ],
-)
-def test_after_ctrl_c_it_is_said_what_was_done(
-    bench: Bench, steps: list[object], said: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    answers = [bench.connect(*step) if isinstance(step, tuple) else step for step in steps]
-    with pytest.raises(KeyboardInterrupt):
-        bench.do(*(("Connect", answer) for answer in answers))
-    assert capsys.readouterr().err == said
 
 
 def test_ctrl_c_while_a_servo_is_written_to_is_said_so(
@@ -243,26 +122,6 @@ def test_each_servo_opens_the_port_again_as_a_board_on_usb_drops_out(
     assert (bench.code, opened) == (0, 5)  # when it begins, for each servo and once more, and at the end
     assert "port /dev/null not found" in script.text
     assert bench.servo(0) == (5, 3, 10, 70)
-
-
-@pytest.mark.parametrize(
-    ("joints", "said"), [(("elbo",), "no joint elbo; did you mean elbow"), ((), "bus main is simulated")]
-)
-def test_wrong_input_is_refused_before_anything_is_done(
-    tmp_path: Path, joints: tuple[str, ...], said: str
-) -> None:
-    bench = Bench(tmp_path, ROBOT if joints else ROBOT.replace('"${at}"', "sim"))
-    with pytest.raises(InputError, match=said):
-        bench.do(joints=joints)
-    assert bench.line.heard == []
-
-
-def test_a_group_means_its_joints_and_torque_goes_off(bench: Bench) -> None:
-    bench.line.bus.servos[1].poke("torque_enable", 1)
-    bench.do(("for wrist", bench.connect(1)), ("all", ""), joints=("hand",))
-    assert bench.code == 0
-    assert not bench.line.bus.servos[1].torque_on
-    assert "wrist: is limp" in bench.script.text
 
 
 # The port
@@ -357,21 +216,3 @@ def test_a_port_of_an_argument_is_told(bench: Bench, desk: Desk) -> None:
     script = bench.do(*steps, joints=("elbow",), search=True)
     assert f"as an argument: {desk.directory}/a-id7" in script.text
     assert bench.path.read_text() == ROBOT
-
-
-def test_a_servo_of_another_robot_gets_the_settings_of_the_factory_that_no_run_starts_without(
-    bench: Bench,
-) -> None:
-    wrist = bench.line.bus.servos[1]
-    for name, value in (("secondary_shadow_id", 2), ("homing_offset", 9), ("pwm_limit", 500)):
-        wrist.poke(name, value)
-    script = bench.do(
-        ("Connect the servo for wrist", bench.connect(1)),
-        ("Connect all", bench.connect(1)),
-        joints=("wrist",),
-    )
-    assert bench.code == 0, script.text
-    names = ("secondary_shadow_id", "homing_offset", "pwm_limit")
-    assert [wrist.registers[name] for name in names] == [255, 0, 500]
-    assert "wrist: Secondary (Shadow) ID (12) was changed from 2 to 255" in script.text
-    assert "wrist: ID 1 on bus main differs from the factory settings: PWM Limit (36) = 500" in script.text

@@ -55,12 +55,13 @@ def refusal(run: SampledRun, number: int) -> str:
 
 def test_a_joint_is_led_by_hand_and_holds_where_it_was_put(start):
     run = start()
-    run.ask(400, torque(["elbow"], on=False, release=True))
+    off = run.ask(400, torque(["elbow"], on=False, release=True))
+    refused = run.ask(600, switch(["arm"]))
     run.at(700, lambda: turn_by_hand(run.servos["elbow"], 2.5))
-    run.ask(1000, torque(["elbow"], on=True))
-    run.ask(1300, switch(["arm"]))
+    on, again = run.ask(1000, torque(["elbow"], on=True)), run.ask(1300, switch(["arm"]))
     log = run.run()
-    assert run.is_done()
+    assert run.is_done(off, on, again)
+    assert "elbow (ID 2 on bus main) is limp" in refusal(run, refused)
     shown = torque_of(log, "elbow")
     assert [one for one in shown if one not in (Torque.OFF, Torque.DOUBT)] == [
         Torque.ON, Torque.RELEASED, Torque.GIVEN, Torque.ON,

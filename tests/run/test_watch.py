@@ -497,19 +497,25 @@ LATE_NS = 5000 * MS
         pytest.param(6, HALTED_NS, id="its ID is that of another process"),
         pytest.param(without_entry, HALTED_NS, id="it has no entry"),
         pytest.param(unreadable, LATE_NS, id="its entry is unreadable"),
-        pytest.param(None, LATE_NS, id="its time of start is unknown"),
+        pytest.param("no entry at first", LATE_NS, id="its time of start is unknown"),
+        pytest.param("unreadable at first", LATE_NS, id="its time of start was unreadable"),
     ],
 )
 def test_a_process_is_silent_soon_only_if_it_cannot_run(watched, change, after_ns):
     folder = watched("S")
-    if change is None:
+    if change == "no entry at first":
         without_entry(folder)
+    elif change == "unreadable at first":
+        unreadable(folder)
     signs = SignsOfLife(7, 100 * MS, 0, folder)
-    if isinstance(change, str):
+    if change == "unreadable at first":
+        (folder / "7/stat").rmdir()
+        watched("S")
+    elif change in {*"TtZXRSD"}:
         watched(change)
     elif isinstance(change, int):
         watched("S", start_ticks=change)
-    elif change is not None:
+    elif callable(change):
         change(folder)
     times = range(0, 5300, 50)
     silent = []
