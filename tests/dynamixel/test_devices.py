@@ -82,6 +82,13 @@ def poke(rig, name, number, index=0):
     device(rig, index).registers[name] = number
 
 
+def cycle_valid(rig, count=1):
+    """Run cycles in which every servo is valid."""
+    for _ in range(count):
+        rig.cycle()
+        assert rig.states.valid.all()
+
+
 @pytest.mark.parametrize("capabilities", [ALL, '["bulk_read"]', '["sync_read"]', NONE])
 def test_states_come_in_si_units_with_the_servos_in_every_way_of_reading(capabilities):
     rig = started(("warm", "rate"), ("pwm",), ("speed",), capabilities=capabilities)
@@ -98,10 +105,8 @@ def test_states_come_in_si_units_with_the_servos_in_every_way_of_reading(capabil
     assert (rig.sources.age_ns < 3_000_000).all()
     assert rig.events.of(EventCode.READ_LOST) == []
     # one instruction where the devices can be asked with the servos, and one more for each that cannot
-    reads = [packet for packet in rig.into_bus()[-9:] if packet[7] in {0x02, 0x82, 0x92, 0x8A, 0x9A}]
-    (plan,) = rig.plans
-    assert len(plan.groups) == {ALL: 1, '["bulk_read"]': 2, '["sync_read"]': 4, NONE: 4}[capabilities]
-    assert reads
+    groups = {ALL: 1, '["bulk_read"]': 2, '["sync_read"]': 4, NONE: 4}[capabilities]
+    assert len(rig.plans[0].groups) == groups
 
 
 def test_a_device_of_two_blocks_is_valid_when_both_came():
@@ -125,13 +130,9 @@ def test_a_lost_device_costs_the_servos_nothing(fast, capabilities):
     rig = started(*wanted, fast=fast, capabilities=capabilities, period_ns=period_ns)
     rig.cycles(20)
     ages, latest = [], []
-    cycles = 260 if period_ns == 5_000_000 else 150
-    for cycle in range(cycles):
-        if cycle == 10:
-            device(rig, 2).silence()
-        if cycle == 100:
-            device(rig, 2).silence(on=False)
-        rig.restless = 0.01
+    for cycle in range(260 if period_ns == 5_000_000 else 150):
+        if cycle in {10, 100}:
+            device(rig, 2).silence(cycle == 10)
         began = rig.clock.now_ns()
         rig.hardware.read_states()
         latest.append(rig.clock.now_ns() - began)
@@ -142,8 +143,7 @@ def test_a_lost_device_costs_the_servos_nothing(fast, capabilities):
         rig.clock.wait_until(began + period_ns)
         assert rig.states.valid.all()
         assert rig.hardware._servos[0].life.torqued.all()
-        others = [row for row in range(4) if row != 2]
-        assert rig.sources.valid[others].all() or cycle in {10, 11, 12, 13}
+        assert rig.sources.valid[[0, 1, 3]].all() or cycle in {10, 11, 12, 13}
         ages.append(int(rig.sources.age_ns[2]))
     assert max(latest) < period_ns - 1_000_000
     # away from the second cycle on: the reads are as short as without it
@@ -196,8 +196,7 @@ def test_a_device_that_answers_only_alone_is_read_alone(monkeypatch, fast):
     monkeypatch.setattr(device(rig), "_takes_part", lambda read: False)
     for cycle in range(30):
         poke(rig, "profile_velocity", cycle)
-        rig.cycle()
-        assert rig.states.valid.all()
+        cycle_valid(rig)
     assert rig.sources.valid.all()
     assert rig.sources.values[0] == 29
     ((source, text),) = rig.events.of(EventCode.SETUP)[-1:]
@@ -214,9 +213,7 @@ def test_a_device_that_answers_only_between_the_cycles_is_asked_seldom(monkeypat
     monkeypatch.setattr(
         device(rig), "execute_packet", lambda *given: None if reads.begun else execute(*given)
     )
-    for _ in range(120):
-        rig.cycle()
-        assert rig.states.valid.all()
+    cycle_valid(rig, 120)
     (lost, *_) = rig.events.of(EventCode.DEVICE_LOST)
     assert "answers single reads, but not those of the cycles" in lost[1]
     assert len(rig.events.of(EventCode.DEVICE_LOST)) <= 3
@@ -355,8 +352,6 @@ def test_protocol_1_reads_each_device_by_itself_and_keeps_the_chain_of_servos():
     assert rig.plans[0].groups == ((0, 1), (2,))
     assert rig.sources.values.tolist() == [pytest.approx(12.0)]
     rig.buses[0].servos[-1].silence()
-    for _ in range(50):
-        rig.cycle()
-        assert rig.states.valid.all()
+    cycle_valid(rig, 50)
     assert not rig.sources.valid[0]
     assert rig.events.of(EventCode.DEVICE_LOST)

@@ -6,13 +6,7 @@ import re
 import pytest
 from msgspec.structs import replace
 
-from dxlrun.dynamixel.remedies import (
-    CHECK,
-    INJECTED,
-    choose_remedy,
-    describe_late_start,
-    late_replies,
-)
+from dxlrun.dynamixel.remedies import CHECK, INJECTED, choose_remedy, describe_late_start, late_replies
 from dxlrun.errors import PortError, StartUpError
 from dxlrun.plan.machine_load import MachineLoad
 from dxlrun.testing import VirtualRobot, plan_of
@@ -32,13 +26,17 @@ def line():
     os.close(slave)
 
 
+def timer_of(tmp_path, port, text):
+    """Write the file in which the kernel would show the timer of a port's adapter."""
+    place = tmp_path / "bus/usb-serial/devices" / os.path.basename(port) / "latency_timer"
+    place.parent.mkdir(parents=True)
+    place.write_text(text)
+    return place
+
+
 @pytest.fixture
 def timer(tmp_path, line):
-    """Return the file in which the kernel would show the timer of the line's adapter, which is 16 ms."""
-    place = tmp_path / "bus/usb-serial/devices" / os.path.basename(line) / "latency_timer"
-    place.parent.mkdir(parents=True)
-    place.write_text("16\n")
-    return place
+    return timer_of(tmp_path, line, "16\n")
 
 
 def shortened(line, most_ns, system):
@@ -46,14 +44,11 @@ def shortened(line, most_ns, system):
         return shorten(port.fileno(), line, most_ns, system)
 
 
-def test_a_timer_that_is_longer_than_the_robot_file_says_is_shortened(tmp_path, line, timer):
-    assert shortened(line, MS, tmp_path) == (f"{line}: latency timer set from 16 ms to 1 ms", "")
-    assert timer.read_text() == "1"
-
-
-def test_a_timer_that_is_as_short_as_the_robot_file_says_is_left_alone(tmp_path, line, timer):
+def test_a_timer_is_shortened_where_it_is_longer_than_the_robot_file_says(tmp_path, line, timer):
     assert shortened(line, 16 * MS, tmp_path) == ("", "")
     assert timer.read_text() == "16\n"
+    assert shortened(line, MS, tmp_path) == (f"{line}: latency timer set from 16 ms to 1 ms", "")
+    assert timer.read_text() == "1"
 
 
 def test_an_adapter_without_a_timer_is_nobodys_fault(tmp_path, line):
@@ -62,8 +57,8 @@ def test_an_adapter_without_a_timer_is_nobodys_fault(tmp_path, line):
 
 
 @pytest.mark.parametrize("unreadable", ["", "soon", "16 ms"])
-def test_a_timer_that_says_no_number_is_none(tmp_path, line, timer, unreadable):
-    timer.write_text(unreadable)
+def test_a_timer_that_says_no_number_is_none(tmp_path, line, unreadable):
+    timer_of(tmp_path, line, unreadable)
     assert latency_timer(line, tmp_path) is None
 
 
@@ -108,11 +103,10 @@ def with_a_timer(tmp_path, latency_ms, port="sim"):
     path = tmp_path / "pair.yaml"
     path.write_text(ROBOT)
     plan = plan_of(path, duration_s=0.2)
-    (bus,) = plan.buses
     robot = VirtualRobot(plan)
-    for one in robot.robot.hardware._start_up._plans:
-        assert one is bus
-    robot.robot.hardware._start_up._plans = [replace(bus, latency_ns=latency_ms * MS, port=port)]
+    start_up = robot.robot.hardware._start_up
+    assert start_up._plans[0] is plan.buses[0]
+    start_up._plans = [replace(plan.buses[0], latency_ns=latency_ms * MS, port=port)]
     return robot
 
 
@@ -128,7 +122,9 @@ def test_replies_later_than_planned_are_reported_before_any_servo_has_torque(tmp
     assert re.match(start, sentence), sentence
     assert sentence.endswith(" (planned for the adapter: 1 ms)"), "nothing shows the cause"
     torque_on = bytes.fromhex("0318")  # a write to Torque Enable (24)
-    assert not any(torque_on in entry.data for entry in robot.ledger.entries if entry.direction == "in")
+    sent = [entry.data for entry in robot.ledger.entries if entry.direction == "in"]
+    assert sent
+    assert not any(torque_on in data for data in sent)
 
 
 @pytest.mark.parametrize("latency_ms", [7, 16])
@@ -138,15 +134,14 @@ def test_a_timer_that_the_reads_can_wait_for_is_no_reason_not_to_start(tmp_path,
     assert robot.record.states.valid.all()
 
 
+LINK = "/dev/serial/by-id/usb-FTDI"
+
+
 @pytest.mark.parametrize(
     ("port", "extra_ms", "named"),
     [
         ("/dev/ttyUSB0", 15.9, "devices/ttyUSB0/latency_timer"),
-        (
-            "/dev/serial/by-id/usb-FTDI",
-            12.0,
-            "devices/$(basename $(readlink -f /dev/serial/by-id/usb-FTDI))/",
-        ),
+        (LINK, 12.0, f"devices/$(basename $(readlink -f {LINK}))/"),
         ("/dev/ttyUSB0", 18.1, ""),
         ("/dev/ttyUSB0", 11.9, ""),
         ("sim", 16.0, ""),
@@ -154,8 +149,7 @@ def test_a_timer_that_the_reads_can_wait_for_is_no_reason_not_to_start(tmp_path,
 )
 def test_only_what_looks_like_the_timer_is_called_one(port, extra_ms, named):
     sentence, remedy = late_replies("main", port, extra_ms * MS, MS)
-    assert bool(remedy) == bool(named)
-    assert ("latency timer" in sentence) == bool(named)
+    assert bool(remedy) == bool(named) == ("latency timer" in sentence)
     assert named in remedy
 
 
@@ -178,12 +172,10 @@ def test_remedy_is_for_the_machine_first_and_never_for_simulated_parts(port, loa
     assert choose_remedy(port, CHECK, load=load) == remedy
 
 
-@pytest.mark.parametrize(("found_ms", "named"), [(16, True), (1, False), (None, False)])
-def test_late_start_names_the_timer_that_the_kernel_shows(tmp_path, found_ms, named):
-    place = tmp_path / "bus/usb-serial/devices/ttyUSB7/latency_timer"
-    if found_ms is not None:
-        place.parent.mkdir(parents=True)
-        place.write_text(f"{found_ms}\n")
+@pytest.mark.parametrize(("found", "named"), [("16\n", True), ("1\n", False), (None, False)])
+def test_late_start_names_the_timer_that_the_kernel_shows(tmp_path, found, named):
+    if found is not None:
+        timer_of(tmp_path, "ttyUSB7", found)
     sentence = describe_late_start("main", "/dev/ttyUSB7", [15 * MS, 0, 14 * MS], MS, tmp_path)
     assert sentence.startswith(
         "2 of 3 replies on bus main were delayed by up to 15 ms (planned for the adapter: 1 ms)"

@@ -25,78 +25,59 @@ from dxlwire.exchange.owed import OwedReplies
 from dxlwire.exchange.samples import Samples
 from dxlwire.modes import Mode
 
+LIMP, RELEASED, OFFLINE, GIVEN = ServoState.LIMP, ServoState.RELEASED, ServoState.OFFLINE, ServoState.GIVEN
+RETURNING, STOPPED, HOLDING = ServoState.RETURNING, ServoState.STOPPED, ServoState.HOLDING
 LEGAL = {(state, event) for state, events in TRANSITIONS.items() for event in events}
 
 
-@pytest.fixture
-def one():
-    """The life of one servo, apart from any line."""
+@pytest.mark.parametrize(("state", "event"), sorted(itertools.product(ServoState, ServoEvent), key=str))
+def test_what_follows_from_a_state_is_derived_at_each_transition_and_no_other_is_made(state, event):
     plan = make_plan((1,))
     rig = make_rig(plan)
-    reads = CyclicReads(
-        plan,
-        Samples([plan], States.empty(1), SourceStates.empty(), None).buses[0],
-        OwedReplies(rig.clock.now_ns),
-    )
-    return Life(rig.hardware._idle[0], reads, rig.events)
-
-
-def put(servo, state):
-    servo.states[0] = state
-    servo.losses = (
-        {0: life.OfflineServo(True, True, False, False, False, 0)} if state is ServoState.OFFLINE else {}
-    )
-    servo.reads.away[0] = state is ServoState.OFFLINE
-
-
-@pytest.mark.parametrize(("state", "event"), sorted(LEGAL, key=str))
-def test_what_follows_from_a_state_is_derived_at_each_transition(one, state, event):
-    put(one, state)
+    samples = Samples([plan], States.empty(1), SourceStates.empty(), None)
+    reads = CyclicReads(plan, samples.buses[0], OwedReplies(rig.clock.now_ns))
+    one = Life(rig.hardware._idle[0], reads, rig.events)
+    one.states[0], reads.away[0] = state, state is OFFLINE
+    if state is OFFLINE:
+        one.losses = {0: life.OfflineServo(True, True, False, False, False, 0)}
+    if (state, event) not in LEGAL:
+        with pytest.raises(IllegalTransition, match=f"main_1_joint .* is {state.value}; {event.value}"):
+            one.on(0, event)
+        assert (one.states[0], reads.away[0]) == (state, state is OFFLINE)
+        return
     after = one.on(0, event)
     assert after is TRANSITIONS[state][event] is one.states[0]
     assert one.torqued[0] == (after in GETS_GOALS)
-    assert one.reads.away[0] == (after is ServoState.OFFLINE)
-    slow = after in (ServoState.STOPPED, ServoState.RETURNING, ServoState.OFFLINE)
-    np.testing.assert_equal(one.ceiling[0], RETURN_SPEED if slow else np.nan)
-
-
-@pytest.mark.parametrize(
-    ("state", "event"), sorted(set(itertools.product(ServoState, ServoEvent)) - LEGAL, key=str)
-)
-def test_an_event_that_a_state_does_not_have_is_refused_and_changes_nothing(one, state, event):
-    put(one, state)
-    with pytest.raises(IllegalTransition, match=f"main_1_joint .* is {state.value}; {event.value}"):
-        one.on(0, event)
-    assert one.states[0] is state
-    assert one.reads.away[0] == (state is ServoState.OFFLINE)
+    assert reads.away[0] == (after is OFFLINE)
+    np.testing.assert_equal(
+        one.ceiling[0], RETURN_SPEED if after in {STOPPED, RETURNING, OFFLINE} else np.nan
+    )
 
 
 def test_no_state_gets_goals_but_by_torque_that_was_read():
     """A goal may switch torque on: only torque enable = 1, read after the last doubt, leads to goals."""
-    for (state, event), after in ((pair, TRANSITIONS[pair[0]][pair[1]]) for pair in LEGAL):
-        if after in GETS_GOALS and state not in GETS_GOALS:
-            assert event is ServoEvent.TORQUE_ON
-            assert state in life.IN_DOUBT
+    leading = [(state, event) for state, event in LEGAL if TRANSITIONS[state][event] in GETS_GOALS]
+    found = [(state, event) for state, event in leading if state not in GETS_GOALS]
+    assert {event for _, event in found} == {ServoEvent.TORQUE_ON}
+    assert {state for state, _ in found} <= life.IN_DOUBT
 
 
 def test_a_servo_that_its_watchdog_stopped_follows_no_goal_at_full_speed():
     """Its goal may have moved on meanwhile: it is limp, or returns slowly."""
     after = {TRANSITIONS[state][event] for state, event in LEGAL if event is ServoEvent.WATCHDOG}
-    assert after == life.POWERLESS | {ServoState.STOPPED, ServoState.GIVEN}
+    assert after == life.POWERLESS | {STOPPED, GIVEN}
 
 
 def test_a_released_servo_gets_no_goals_on_any_way_but_a_return_or_a_request():
-    reached, new = {ServoState.RELEASED}, {ServoState.RELEASED}
+    reached, new = {RELEASED}, {RELEASED}
     while new:
-        found = {
-            TRANSITIONS[state][event]
-            for state in new
-            for event in TRANSITIONS[state]
-            if event is not ServoEvent.REQUESTED
-        }
-        new = {state for state in found - reached if state is not ServoState.OFFLINE}
+        ways = [
+            (state, event) for state, event in LEGAL if state in new and event is not ServoEvent.REQUESTED
+        ]
+        found = {TRANSITIONS[state][event] for state, event in ways}
+        new = found - reached - {OFFLINE}
         reached |= found
-    assert reached == {ServoState.RELEASED, ServoState.OFFLINE}
+    assert reached == {RELEASED, OFFLINE}
 
 
 @pytest.fixture
@@ -121,66 +102,71 @@ class Story:
         plan = make_plan((11, 12, 13), name="arm", return_delay_ns=0, **model)
         self.plan = replace(plan, watchdog_ticks=10 if protocol == 2.0 else 0)
         self.rig = make_rig(self.plan)
-        self.servo = self.rig.servo(12)
-        self.life = self.rig.hardware._servos[0].life
+        self.servo, self.hardware = self.rig.servo(12), self.rig.hardware
+        self.life = self.hardware._servos[0].life
 
     @property
     def state(self):
         return self.life.states[1]
 
-    def until(self, *states, most=200):
-        for _ in range(most):
+    def until(self, *states):
+        for _ in range(200):
             if self.state in states:
                 return
             self.rig.cycle()
         raise AssertionError(f"it is {self.state}")
 
+    def answers_until(self, *states):
+        self.servo.silence(False)
+        self.until(*states)
+
     def lose(self):
         self.servo.silence()
-        self.until(ServoState.OFFLINE)
+        self.until(OFFLINE)
 
     def reset(self):
-        """Let it start anew while it is away, and come back limp."""
+        """Let it start again while it is away, and come back limp."""
         self.lose()
         self.returned_limp()
 
-    def come_to(self, state):
-        """Bring the servo into a state by what happens to a real one."""
-        if state is ServoState.LIMP and self.plan.protocol == 2.0:
-            return  # not started yet
-        self.rig.hardware.start()
-        if state is ServoState.LIMP:
-            self.reset()
-        elif state is ServoState.RELEASED:
-            self.rig.hardware.switch_torque(1, False)
-            self.rig.cycles(5)
-        elif state is ServoState.OFFLINE:
-            self.lose()
-        elif state is ServoState.GIVEN:
-            self.reset()
-            self.rig.anchors = False
-            self.rig.hardware.switch_torque(1, True)
-        elif state in (ServoState.RETURNING, ServoState.STOPPED):
-            self.rig.goals.position[1] += 1.0
-            self.lose()
-            self.servo.silence(False)
-            self.until(ServoState.RETURNING)
-        if state in (ServoState.HOLDING, ServoState.STOPPED):
-            self.miss()
-        self.until(state)
+    def start_and_reset(self):
+        self.hardware.start()
+        self.reset()
 
     def miss(self):
         self.servo.silence()
         self.rig.cycle()
 
-    # What happens
+    def come_to(self, state):
+        """Bring the servo into a state by what happens to a real one."""
+        if state is LIMP and self.plan.protocol == 2.0:
+            return  # not started yet
+        self.hardware.start()
+        if state in {LIMP, GIVEN}:
+            self.reset()
+        if state is RELEASED:
+            self.hardware.switch_torque(1, False)
+            self.rig.cycles(5)
+        elif state is OFFLINE:
+            self.lose()
+        elif state is GIVEN:
+            self.rig.anchors = False
+            self.hardware.switch_torque(1, True)
+        elif state in {RETURNING, STOPPED}:
+            self.rig.goals.position[1] += 1.0
+            self.lose()
+            self.answers_until(RETURNING)
+        if state in {HOLDING, STOPPED}:
+            self.miss()
+        self.until(state)
+
+    # What happens, by the name of its event
 
     def engaged(self):
-        self.rig.hardware.start()
+        self.hardware.start()
 
     def torque_on(self):
-        self.servo.silence(False)
-        self.until(ServoState.TORQUED, ServoState.RETURNING)
+        self.answers_until(ServoState.TORQUED, RETURNING)
 
     def torque_off(self):
         """A servo of Protocol 1.0 shuts down: its torque enable stays 1, its Torque Limit is 0."""
@@ -189,16 +175,15 @@ class Story:
         self.rig.cycles(10)
 
     def doubt(self):
-        if self.state is not ServoState.OFFLINE:
-            for _ in range(30):
-                self.miss()
+        if self.state is OFFLINE:
+            self.hardware.stop()
             return
-        self.rig.hardware.stop()
+        for _ in range(30):
+            self.miss()
 
     def watchdog(self):
-        if self.state is ServoState.LIMP:
-            self.rig.hardware.start()
-            self.reset()
+        if self.state is LIMP:
+            self.start_and_reset()
         self.rig.clock.wait_until(self.rig.clock.now_ns() + 300_000_000)
         self.rig.cycle(idle=False)
 
@@ -206,26 +191,25 @@ class Story:
         self.until(ServoState.TORQUED)
 
     def lost(self):
-        if self.state is ServoState.LIMP:
-            self.come_to(ServoState.TORQUED)
-            self.reset()
+        if self.state is LIMP:
+            self.start_and_reset()
         self.rig.buses[0].unplug()
         self.rig.goals.position[0] += 0.1
-        self.rig.hardware.write_goals()
+        self.hardware.write_goals()
         self.rig.buses[0].plug_in()
-        self.rig.hardware.idle(self.rig.clock.now_ns() + 10_000_000)
+        self.hardware.idle(self.rig.clock.now_ns() + 10_000_000)
 
     def torque_given(self):
-        if self.state is ServoState.LIMP:
+        if self.state is LIMP:
             self.requested()
-        elif self.state is ServoState.OFFLINE:
+        elif self.state is OFFLINE:
             self.lost()
         else:
             self.rig.set_modes(0, Mode.VELOCITY, 0)
         self.servo.silence(False)
         for _ in range(60):
             self.rig.cycle()
-            if self.state is ServoState.GIVEN and self.rig.states.mode[1] != Mode.UNKNOWN:
+            if self.state is GIVEN and self.rig.states.mode[1] != Mode.UNKNOWN:
                 return
 
     def anchored(self):
@@ -233,22 +217,19 @@ class Story:
         self.rig.cycle()
 
     def returned(self):
-        self.servo.silence(False)
-        self.until(ServoState.RETURNING)
+        self.answers_until(RETURNING)
 
     def returned_limp(self):
         self.servo.power_cycle()
-        self.servo.silence(False)
-        self.until(ServoState.LIMP)
+        self.answers_until(LIMP)
 
     def release(self):
-        self.rig.hardware.switch_torque(1, False)
+        self.hardware.switch_torque(1, False)
 
     def requested(self):
-        if self.state is ServoState.LIMP:
-            self.rig.hardware.start()
-            self.reset()
-        self.rig.hardware.switch_torque(1, True)
+        if self.state is LIMP:
+            self.start_and_reset()
+        self.hardware.switch_torque(1, True)
 
 
 @pytest.mark.parametrize(("state", "event"), sorted(LEGAL, key=str))
@@ -262,18 +243,17 @@ def test_each_legal_transition_is_reached_by_what_a_servo_does(recorded, state, 
 
 def test_a_servo_that_is_lost_after_it_was_let_go_is_released_again_when_it_is_back():
     story = Story()
-    story.come_to(ServoState.RELEASED)
+    story.come_to(RELEASED)
     story.lose()
-    story.servo.silence(False)
-    story.until(ServoState.RELEASED, ServoState.LIMP, ServoState.RETURNING)
-    assert story.state is ServoState.RELEASED
+    story.answers_until(RELEASED, LIMP, RETURNING)
+    assert story.state is RELEASED
     assert story.rig.torque() == [True, False, True]
 
 
 def test_torque_that_was_read_before_a_servo_was_let_go_gives_it_no_goals():
     """Its torque enable is still being read when the policy comes: the late 1 must not count."""
     story = Story(protocol=1.0)
-    story.come_to(ServoState.HOLDING)
+    story.come_to(HOLDING)
     rig = story.rig
     rig.restless = 0.02
     story.servo.silence(False)
@@ -282,10 +262,10 @@ def test_torque_that_was_read_before_a_servo_was_let_go_gives_it_no_goals():
     rig.hardware.switch_torque(1, False)
     since = len(rig.into_bus())
     rig.cycles(20)
-    assert story.state is ServoState.RELEASED
-    goals = [packet for packet in rig.into_bus()[since:] if packet[4] == 0x83]
+    assert story.state is RELEASED
+    goals = rig.goals_sent(since)
     assert goals
-    assert not any(12 in packet[7:-1:5] for packet in goals)
+    assert not any(12 in ids for _, ids in goals)
     assert rig.torque() == [True, False, True]
 
 
@@ -298,6 +278,7 @@ def test_faults_in_random_order_cause_only_legal_transitions(number, protocol, c
     rig.hardware.start()
     rig.restless = 0.002  # a goal to each in every cycle
     let_go: set[int] = set()
+    answers: list[list[str]] = []
 
     def pull():
         line.unplug()
@@ -309,8 +290,6 @@ def test_faults_in_random_order_cause_only_legal_transitions(number, protocol, c
         let_go.add(chance.randrange(3))
         for row in let_go:
             rig.hardware.switch_torque(row, False)
-
-    answers: list[list[str]] = []
 
     def request():
         row = chance.randrange(3)
@@ -340,16 +319,15 @@ def test_faults_in_random_order_cause_only_legal_transitions(number, protocol, c
             begun = len(rig.into_bus())
             rig.hardware.read_states()
             rig.hardware.write_goals()
-            gets = [
-                servo.servo_id for servo, on in zip(story.plan.servos, story.life.torqued, strict=True) if on
-            ]
+            servos = zip(story.plan.servos, story.life.torqued, strict=True)
+            gets = {servo.servo_id for servo, on in servos if on}
             for packet in rig.into_bus()[begun:]:
                 address, named = goals_in(packet, protocol) or (0, [])
-                assert address == 98 or set(named) <= set(gets)  # 98 is the Bus Watchdog
+                assert address == 98 or gets.issuperset(named)  # 98 is the Bus Watchdog
             rig.hardware.idle(rig.clock.now_ns() + 15_000_000)
             rig.clock.wait_until(rig.clock.now_ns() + 5_000_000)
             for index in let_go:
-                assert story.life.states[index] in (ServoState.RELEASED, ServoState.OFFLINE)
+                assert story.life.states[index] in {RELEASED, OFFLINE}
     line.plug_in()
     for servo in line.servos:
         servo.silence(False)

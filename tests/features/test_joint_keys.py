@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -40,28 +40,12 @@ RAD_PER_TICK = np.radians(300) / 1023
 
 
 @pytest.fixture(autouse=True)
-def with_backlash(tmp_path: Path) -> Iterator[None]:
+def with_backlash(project: Callable[..., Path]) -> Iterator[None]:
     """Install the package whose files are on the page."""
     section = PAGE.read_text().partition("## A key of joints")[2]
-    files = dict(
-        zip(
-            ("joint_key", "compile", "layer"), re.findall(r"```python\n(.*?)```", section, re.S), strict=False
-        )
-    )
-    files |= {
-        "__init__": "",
-        "plugin": "from dxlrun.tooling.features import Feature\n\n\n"
-        "def dxlrun_features():\n    return [Feature('backlash', 'dxlrun_backlash')]\n",
-    }
-    package = tmp_path / "project" / "src" / "dxlrun_backlash"
-    package.mkdir(parents=True)
-    for name, text in files.items():
-        (package / f"{name}.py").write_text(text)
-    (tmp_path / "project" / "pyproject.toml").write_text(
-        '[project]\nname = "dxlrun-backlash"\nversion = "1.0"\n'
-        '[project.entry-points.dxlrun]\nbacklash = "dxlrun_backlash.plugin"\n'
-    )
-    with installed(tmp_path / "project"):
+    texts = re.findall(r"```python\n(.*?)```", section, re.S)
+    files = dict(zip(("joint_key", "compile", "layer"), texts, strict=False))
+    with installed(project("backlash", **files)):
         yield
     robot_form.cache_clear()
 
@@ -156,39 +140,33 @@ def test_check_shows_the_key_as_a_column(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("form", "example", "written", "shown"),
+    ("name", "form", "example", "written"),
     [
-        ("tuple[Position, Position] | None", "[-1 rad, 1 rad]", "[-1 rad, 1 rad]", "[-1.0, 1.0]"),
-        ("Position | Literal['auto'] | None", "1 deg", "auto", "auto"),
+        ("window", f"{STRICT} | None", "[-1 rad, 1 rad]", "[-1.0, 1.0]"),
+        ("play", "Position | Literal['auto'] | None", "1 deg", "auto"),
     ],
 )
 def test_check_shows_values_that_are_not_a_number(  # noqa: PLR0917  parameters
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], form: str, example: str, written: str, shown: str
+    tmp_path: Path,
+    project: Callable[..., Path],
+    capsys: pytest.CaptureFixture[str],
+    name: str,
+    form: str,
+    example: str,
+    written: str,
 ) -> None:
-    project, package = tmp_path / "other", f"dxlrun_window_{shown.strip('[]')[:1].replace('-', '_')}"
-    (project / "src" / package).mkdir(parents=True)
-    (project / "src" / package / "__init__.py").touch()
-    (project / "src" / package / "joint_key.py").write_text(
+    stage = (
         "from typing import Annotated, Literal\n\nfrom pydantic import Field\n\n"
         "from dxlrun import LINEAR, ROTARY\nfrom dxlrun.tooling.features import JointKey\n"
         "from dxlrun.tooling.files import Position, key\n\n"
-        f"FORM = {form.replace('tuple[Position, Position]', STRICT)}\n"
-        f'EXAMPLE = "{example}"\n'
-        "STAGE = JointKey('window', FORM, key('It.', EXAMPLE, None), value=object,\n"
-        "    examples={ROTARY: EXAMPLE, LINEAR: EXAMPLE})\n"
+        f"STAGE = JointKey({name!r}, {form}, key('It.', '{example}', None), value=object,\n"
+        f"    examples={{ROTARY: '{example}', LINEAR: '{example}'}})\n"
     )
-    (project / "src" / package / "plugin.py").write_text(
-        "from dxlrun.tooling.features import Feature\n\n\n"
-        f"def dxlrun_features():\n    return [Feature('window', {package!r})]\n"
-    )
-    (project / "pyproject.toml").write_text(
-        f'[project]\nname = "window"\nversion = "1.0"\n'
-        f'[project.entry-points.dxlrun]\nwindow = "{package}.plugin"\n'
-    )
-    (tmp_path / "robot.yaml").write_text(ROBOT.replace("backlash: 4 deg", f"window: {written}"))
-    with installed(project):
+    value = written.replace(".0", " rad")
+    (tmp_path / "robot.yaml").write_text(ROBOT.replace("backlash: 4 deg", f"{name}: {value}"))
+    with installed(project(name, joint_key=stage)):
         assert check.check_robot(tmp_path / "robot.yaml") == 0
-    assert shown in capsys.readouterr().out
+    assert written in capsys.readouterr().out
 
 
 def test_no_column_while_no_joint_has_the_key(tmp_path: Path) -> None:

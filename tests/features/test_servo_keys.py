@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -46,13 +46,6 @@ def glow(file, servo, table):
 
 STAGE = SettingsStage(glow)
 """
-PLUGIN = """
-from dxlrun.tooling.features import Feature
-
-
-def dxlrun_features():
-    return [Feature("glow", "dxlrun_glow")]
-"""
 ROBOT = """name: lamps
 buses:
   main: {port: sim, protocol: 2.0, baud_rate: 1_000_000, adapter: {latency: 1 ms}, return_delay_time: 500 us}
@@ -77,18 +70,9 @@ GLOWING = {1, 3, 5}
 
 
 @pytest.fixture(autouse=True)
-def with_glow(tmp_path: Path) -> Iterator[None]:
+def with_glow(project: Callable[..., Path]) -> Iterator[None]:
     """Install the package."""
-    package = tmp_path / "project" / "src" / "dxlrun_glow"
-    package.mkdir(parents=True)
-    files = {"__init__": "", "servo_key": SERVO_KEY, "settings": SETTINGS, "plugin": PLUGIN}
-    for name, text in files.items():
-        (package / f"{name}.py").write_text(text)
-    (tmp_path / "project" / "pyproject.toml").write_text(
-        '[project]\nname = "dxlrun-glow"\nversion = "1.0"\n'
-        '[project.entry-points.dxlrun]\nglow = "dxlrun_glow.plugin"\n'
-    )
-    with installed(tmp_path / "project"):
+    with installed(project("glow", servo_key=SERVO_KEY, settings=SETTINGS)):
         yield
 
 
