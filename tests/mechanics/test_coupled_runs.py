@@ -7,6 +7,7 @@ import pytest
 from msgspec.structs import replace
 from tests.kit.line_faults import turn_by_hand
 from tests.kit.rigs import Events
+from tests.kit.wire import all_writes
 
 from dxlrun.channels.answers import Completion, Refusal
 from dxlrun.channels.commands import CommandMessage
@@ -43,37 +44,21 @@ def sways(monkeypatch):
     monkeypatch.setattr(JointGroupPositionController, "update", update)
 
 
-def writes(entries, instruction=0x83):
-    """Yield time, servo, address and data of every write that the servos received."""
-    for entry in entries:
-        if entry.direction != "in":
-            continue
-        for packet in entry.data.split(b"\xff\xff\xfd\x00")[1:]:
-            body = packet[4:-2]
-            if packet[3] == 0x83 == instruction:
-                address, length = (int.from_bytes(body[at : at + 2], "little") for at in (0, 2))
-                for at in range(4, len(body), length + 1):
-                    yield entry.t_ns, body[at], address, body[at + 1 : at + 1 + length]
-            elif packet[3] == 0x03 == instruction:
-                yield entry.t_ns, packet[0], int.from_bytes(body[:2], "little"), body[2:]
+def written(robot, servo, *addresses):
+    """Return when a servo was told to write which bytes to an address."""
+    entries, (bus,) = robot.ledger.entries, robot.plan.buses
+    return [(t, data) for t, one, at, data in all_writes(entries, bus) if one == servo and at in addresses]
 
 
 def goals(robot, servo, after_ns=0):
     """Return the goal positions that a servo was sent: time and ticks; they stand last in their block."""
-    return [
-        (t, int.from_bytes(data[-4:], "little", signed=True))
-        for t, one, address, data in writes(robot.ledger.entries)
-        if one == servo and address in (112, 116) and t > after_ns
-    ]
+    found = written(robot, servo, 112, 116)
+    return [(t, int.from_bytes(data[-4:], "little", signed=True)) for t, data in found if t > after_ns]
 
 
-def torque_writes(robot, servo):
-    """Return when torque enable (64) of one servo was written, and to what."""
-    return [
-        (t, data[0])
-        for t, one, address, data in writes(robot.ledger.entries, 0x03)
-        if one == servo and address == 64
-    ]
+def torque(robot, servo, after_ns=0, before_ns=1 << 62):
+    """Return what was written to torque enable (64) of a servo in a time."""
+    return [data[0] for t, data in written(robot, servo, 64) if after_ns < t < before_ns]
 
 
 def test_servos_of_one_joint_get_equal_goals_and_no_goal_leaves_the_limits(plan, sways):
@@ -128,14 +113,9 @@ def test_servos_that_disagree_are_refused_before_any_gets_torque(plan, monkeypat
         robot.run()
     assert "the servos of hip disagree by 8.0 deg, more than its tolerance of 3.0 deg" in str(caught.value)
     assert "ID 3 on bus main reports 8.0 deg, ID 2 on bus main reports 0.0 deg" in str(caught.value)
-    assert not any(on for servo in range(1, 8) for _, on in torque_writes(robot, servo))
-    tolerant = replace(
-        wrong,
-        mechanics=replace(
-            wrong.mechanics,
-            couplings=tuple(replace(one, tolerance=math.radians(9)) for one in wrong.mechanics.couplings),
-        ),
-    )
+    assert not any(any(torque(robot, servo)) for servo in range(1, 8))
+    couplings = tuple(replace(one, tolerance=math.radians(9)) for one in wrong.mechanics.couplings)
+    tolerant = replace(wrong, mechanics=replace(wrong.mechanics, couplings=couplings))
     assert VirtualRobot(tolerant).run().reason == "ended"
 
 
@@ -184,11 +164,12 @@ def turned(plan, monkeypatch, tmp_path):
         robot.run()
         address, unit = place
         sent = {}
-        for _, servo, at, data in writes(robot.ledger.entries):
-            goal = int.from_bytes(data[:4], "little", signed=True) * unit
-            if at == address and abs(goal) > abs(sent.get(servo, 0.0)):
-                sent[servo] = goal
-        return sent
+        for servo in (1, 2, 3, 5, 6, 7):
+            ticks = [
+                int.from_bytes(data[:4], "little", signed=True) for _, data in written(robot, servo, address)
+            ]
+            sent[servo] = max(ticks, key=abs, default=0) * unit
+        return {servo: goal for servo, goal in sent.items() if goal}
 
     return run
 
@@ -288,7 +269,7 @@ def test_with_the_policy_limp_the_partner_of_a_lost_servo_loses_its_torque(plan)
     robot = VirtualRobot(plan(more=more, duration_s=1.4))
     lose(robot, 3)
     robot.run()
-    offs = [t for t, value in torque_writes(robot, 2) if not value and GONE_NS < t < BACK_NS]
+    offs = [t for t, data in written(robot, 2, 64) if data == b"\0" and GONE_NS < t < BACK_NS]
     assert offs
     assert not goals(robot, 2, offs[0])
 
@@ -309,11 +290,9 @@ def test_torque_off_at_one_joint_is_off_at_all_its_servos_together(plan, joint, 
     robot.run()
     assert all(isinstance(robot.inbox.answers[number], Completion) for number in (1, 2))
     for servo in servos:
-        changes = [value for t, value in torque_writes(robot, servo) if t > 300_000_000]
-        assert changes[:2] == [0, 1]
+        assert torque(robot, servo, 300_000_000)[:2] == [0, 1]
     for servo in {1, 2, 3, 5, 6, 7} - {*servos}:
-        changes = [value for t, value in torque_writes(robot, servo) if 300_000_000 < t < 1_150_000_000]
-        assert 1 not in changes
+        assert 1 not in torque(robot, servo, 300_000_000, 1_150_000_000)
     # a replay needs the joints alone: it re-runs the log without a servo
     report = replay_log(tmp_path / "run.mcap")
     assert (report.different, report.first, report.fault) == (0, None, "")
@@ -340,7 +319,7 @@ def test_torque_comes_back_within_limits_only_and_if_servos_agree(plan, monkeypa
     assert isinstance(answer, Refusal)
     assert answer.text.count(problem) == 1
     for servo in moved:
-        assert 1 not in [value for t, value in torque_writes(robot, servo) if t > 200_000_000]
+        assert 1 not in torque(robot, servo, 200_000_000)
 
 
 def test_torque_off_at_one_joint_of_a_wrist_takes_the_controllers_of_both(plan, tmp_path):
@@ -362,7 +341,7 @@ def test_a_servo_that_shuts_itself_down_takes_the_torque_of_its_partner(plan, tm
     (bus,) = robot.buses
     bus.at(400_000_000, bus.servo(2).power_cycle)
     robot.run()
-    assert [value for t, value in torque_writes(robot, 3) if 400_000_000 < t < 900_000_000][:1] == [0]
+    assert torque(robot, 3, 400_000_000, 900_000_000)[:1] == [0]
     events = read_log(tmp_path / "run.mcap").events
     texts = [event.text for event in events if event.code == EventCode.TORQUE_OFF]
     assert any(
