@@ -330,6 +330,7 @@ CHANGES: dict[str, Callable[..., object]] = {
         case.rig.buses[0], servo.servo_id, round(float(time) * 1e6)
     ),
     r"write lost": lambda case, _: case.rig.buses[0].alter_next_instruction("lost", lambda _: b""),
+    r"boots in (\S+) s": lambda _, servo, time: setattr(servo, "boot_ns", round(float(time) * 1e9)),
     r"keeps (\w+) (-?\d+)": lambda case, servo, name, value: case.rig.stick(servo.servo_id, name, int(value)),
     r"(\w+) (-?\d+)": poke,
 }
@@ -345,7 +346,7 @@ EXPECTATIONS: dict[str, Callable[..., object]] = {
 }
 
 
-def read_cases(path: Path) -> Iterator[Case]:
+def read_cases(path: Path, kind: type[Case] = Case) -> Iterator[Case]:
     """Yield the cases of a file."""
     block: list[tuple[int, str]] = []
     for number, line in enumerate([*path.read_text("utf-8").splitlines(), ""], 1):
@@ -355,5 +356,5 @@ def read_cases(path: Path) -> Iterator[Case]:
             block.append((number, line))
         elif block:
             (_, title), *lines = block
-            yield Case(path.name, title, lines)
+            yield kind(path.name, title, lines)
             block = []
