@@ -106,6 +106,7 @@ def test_bits_and_codes_are_those_of_the_manual(model):
 @reporting
 def test_each_error_refuses_the_start_by_its_name(table):
     title = table.items[table.errors.item].title
+    assert table.errors.values
     for name, value in table.errors.values.items():
         rig, words = rig_of(table, 1), name.replace("_", " ")
         rig.stick(1, table.errors.item, value)
