@@ -6,34 +6,23 @@ servos. What the servos refused is read from the ledger in the end, and must be 
 
 from __future__ import annotations
 
-import json
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
 
 import pytest
-from dynamixel_sdk import PortHandler
-from tests.kit.awaited import DEADLINE_S
-from tests.kit.bus_process import started
-
-from dxlsim.bus.ledger import LedgerEntry, read_ledger
-from dxlsim.simulation_plan import BusConfig
+from dynamixel_sdk import COMM_SUCCESS, PortHandler, Protocol1PacketHandler, Protocol2PacketHandler
+from tests.kit.awaited import DEADLINE_S, until
+from tests.kit.bus_process import BusProcess
 
 
-class Simulation:
-    """The process of simulated buses."""
+class Simulation(BusProcess):
+    """The process of simulated buses, which is judged in the end."""
 
-    def __init__(self, buses: Sequence[BusConfig], ledger: Path) -> None:
-        self._path = ledger
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
         self._refusals: Counter[str] = Counter()
         self._hasty: set[str] = set()
-        self._child, self._control = started(buses, ledger=str(ledger))
-        self._control.settimeout(DEADLINE_S)
-        self._said = self._control.makefile("rb")
-        first = self._said.readline()
-        self.ports: dict[str, str] = json.loads(first)["ports"] if first else {}
-        """The device file of each bus; none when the process ended at once."""
 
     def expect_refusals(self, bus: str, count: int) -> None:
         """Say how many instructions the servos of a bus were made to refuse."""
@@ -48,24 +37,14 @@ class Simulation:
 
     def fault(self, line: str) -> None:
         """Break something on the running simulation; return when it took the order."""
-        self._control.sendall(json.dumps({"fault": line}).encode() + b"\n")
-        while "fault" not in (said := json.loads(self._said.readline())):
-            assert "error" not in said, said
-
-    def end(self) -> tuple[LedgerEntry, ...]:
-        """Hang up; return what the ledger holds."""
-        try:
-            self._said.close()
-            self._control.close()
-            assert self._child.wait(DEADLINE_S) == 0
-        finally:
-            self._child.kill()
-            self._child.wait()
-        return read_ledger(self._path)
+        said = self.ask(fault=line)
+        while "fault" not in said:
+            assert "happened" in said, said
+            said = self.next()
 
     def judge(self) -> None:
         """End it, and find in the ledger what was expected and no accident."""
-        notes = [(entry.bus, entry.note) for entry in self.end() if entry.direction == "note"]
+        notes = [(entry.bus, entry.note) for entry in self.hang_up() if entry.direction == "note"]
         refused = Counter(bus for bus, note in notes if " refuses " in note)
         for bus in self._hasty:
             refused[bus] = min(refused[bus], self._refusals[bus])
@@ -81,13 +60,9 @@ class Simulation:
 @pytest.fixture(scope="module")
 def simulation(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     """Serve the BUSES of a test's module."""
-    running = Simulation(request.module.BUSES, tmp_path_factory.mktemp("ledger") / "bus.jsonl")
-    try:
+    with Simulation(request.module.BUSES, tmp_path_factory.mktemp("ledger") / "bus.jsonl") as running:
         yield running
-    except BaseException:
-        running.end()
-        raise
-    running.judge()
+        running.judge()
 
 
 class PatientPort(PortHandler):
@@ -124,34 +99,84 @@ class PatientPort(PortHandler):
         return bool(super().isPacketTimeout())
 
 
-class Ports:
-    """The SDK's ports that a test opened."""
+class Item(NamedTuple):
+    """Address and size of an item."""
 
-    def __init__(self, simulation: Simulation) -> None:
-        self._simulation = simulation
-        self._open: list[PatientPort] = []
+    address: int
+    size: int
 
-    def __call__(self, bus: str, rate: int = 1_000_000) -> PatientPort:
-        port = PatientPort(self._simulation.ports[bus])
-        assert port.setBaudRate(rate)
-        self._open.append(port)
-        return port
 
-    def close(self) -> None:
-        """Close them all."""
-        while self._open:
-            self._open.pop().closePort()
+class Host:
+    """A program with the SDK's packet handler on a bus; `read` and `write` are good or fail."""
+
+    def __init__(self, simulation: Simulation, bus: str, protocol: float) -> None:
+        self.simulation, self.bus = simulation, bus
+        self.port = PatientPort(simulation.ports[bus])
+        assert self.port.setBaudRate(1_000_000)
+        self.sdk: Any = Protocol1PacketHandler() if protocol == 1.0 else Protocol2PacketHandler()
+
+    def get(self, servo_id: int, item: Item) -> tuple[int, int, int]:
+        """Return value, result and error of a read, as the SDK has them."""
+        read = getattr(self.sdk, f"read{item.size}ByteTxRx")
+        found: tuple[int, int, int] = read(self.port, servo_id, item.address)
+        return found
+
+    def put(self, servo_id: int, item: Item, value: int) -> tuple[int, int]:
+        """Return result and error of a write."""
+        write = getattr(self.sdk, f"write{item.size}ByteTxRx")
+        found: tuple[int, int] = write(self.port, servo_id, item.address, value)
+        return found
+
+    def read(self, servo_id: int, item: Item) -> int:
+        value, *how = self.get(servo_id, item)
+        assert how == [COMM_SUCCESS, 0]
+        return value
+
+    def write(self, servo_id: int, item: Item, value: int) -> None:
+        assert self.put(servo_id, item, value) == (COMM_SUCCESS, 0)
+
+    def refused(self, servo_id: int, item: Item, value: int) -> str:
+        """Let a servo refuse a write; return the SDK's words for it."""
+        self.simulation.expect_refusals(self.bus, 1)
+        result, error = self.put(servo_id, item, value)
+        assert result == COMM_SUCCESS
+        return str(self.sdk.getRxPacketError(error))
+
+    def near(self, servo_id: int, item: Item, value: int, by: int = 20) -> bool:
+        """Wait until an item is near a value."""
+        return until(lambda: abs(self.read(servo_id, item) - value) <= by)
+
+    def ping(self, servo_id: int) -> int:
+        """Return the model number."""
+        model, *how = self.sdk.ping(self.port, servo_id)
+        assert how == [COMM_SUCCESS, 0]
+        return int(model)
+
+    def is_silent(self, servo_id: int) -> bool:
+        return self._impatiently(lambda: self.sdk.ping(self.port, servo_id)[1] != COMM_SUCCESS)
+
+    def answers_again(self, servo_id: int) -> bool:
+        """Wait until a servo that starts again answers."""
+        self.simulation.expect_haste(self.bus)
+        return self._impatiently(lambda: until(lambda: self.sdk.ping(self.port, servo_id)[1] == COMM_SUCCESS))
+
+    def _impatiently(self, ask: Callable[[], bool]) -> bool:
+        patience, self.port.patience_ms = self.port.patience_ms, 30.0
+        try:
+            return ask()
+        finally:
+            self.port.patience_ms = patience
 
 
 @pytest.fixture
-def open_port(simulation: Simulation) -> Iterator[Ports]:
-    """Open a bus as the SDK's examples do."""
-    ports = Ports(simulation)
-    yield ports
-    ports.close()
+def connect(simulation: Simulation, request: pytest.FixtureRequest) -> Iterator[Callable[..., Host]]:
+    """Open a bus as the SDK's examples do, in the PROTOCOL of the module or another one."""
+    opened: list[Host] = []
 
+    def connect(bus: str, protocol: float = 0.0) -> Host:
+        opened.append(Host(simulation, bus, protocol or request.module.PROTOCOL))
+        return opened[-1]
 
-@pytest.fixture
-def patient_port() -> type[PatientPort]:
-    """Put in the place of the SDK's port where a program opens it itself."""
-    return PatientPort
+    yield connect
+    for host in opened:
+        host.port.closePort()

@@ -16,6 +16,7 @@ from dynamixel_easy_sdk import (
     ProfileConfiguration,
     connector,
 )
+from tests.foreign.conftest import PatientPort
 from tests.kit.awaited import DEADLINE_S, until
 
 from dxlsim.simulation_plan import BusConfig, ServoConfig
@@ -48,11 +49,9 @@ BUSES = (
 
 
 @pytest.fixture
-def connect(
-    simulation: Any, patient_port: Any, monkeypatch: pytest.MonkeyPatch
-) -> Iterator[Callable[[str], Connector]]:
+def connect(simulation: Any, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str], Connector]]:
     """Connect to a bus, through a port that waits."""
-    monkeypatch.setattr(connector, "PortHandler", patient_port)
+    monkeypatch.setattr(connector, "PortHandler", PatientPort)
     opened: list[Connector] = []
 
     def open_bus(name: str) -> Connector:

@@ -8,181 +8,151 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from dynamixel_sdk import COMM_RX_TIMEOUT, COMM_SUCCESS, GroupBulkRead, GroupSyncWrite, Protocol1PacketHandler
-from tests.kit.awaited import DEADLINE_S, until
+from dynamixel_sdk import COMM_RX_TIMEOUT, COMM_SUCCESS, GroupBulkRead, GroupSyncWrite
+from tests.foreign.conftest import Item
+from tests.kit.awaited import until
 
 from dxlsim.simulation_plan import BusConfig, ServoConfig
 
+PROTOCOL = 1.0
 AX12, MX28 = 12, 29
 """Model numbers (e-Manual, control tables, Model Number (0))."""
-ID, BAUD_RATE, RETURN_DELAY, CW_LIMIT, CCW_LIMIT = 3, 4, 5, 6, 8
-TORQUE, LED, GOAL, SPEED, PRESENT, PRESENT_SPEED, REGISTERED, LOCK = 24, 25, 30, 32, 36, 38, 44, 47
-"""Addresses of the AX and MX series."""
+ID, BAUD_RATE, RETURN_DELAY, CW_LIMIT, CCW_LIMIT = Item(3, 1), Item(4, 1), Item(5, 1), Item(6, 2), Item(8, 2)
+TORQUE, LED, GOAL, SPEED, PRESENT = Item(24, 1), Item(25, 1), Item(30, 2), Item(32, 2), Item(36, 2)
+PRESENT_SPEED, REGISTERED, LOCK = Item(38, 2), Item(44, 1), Item(47, 1)
 NEAR = 10
 """Ticks that the examples call arrived."""
-BROADCAST = 0xFE
 MIDDLE = 2.617994
 """150 degrees: tick 512 of an AX, 1707 of an MX."""
+LINES = {
+    "read_write": {1: "AX-12A", 2: "MX-28"},
+    "sync": {1: "AX-12A", 2: "AX-12A"},
+    "bulk": {1: "MX-28", 2: "MX-28", 3: "AX-12A"},
+    "refused": {1: "AX-12A", 2: "MX-28"},
+    "registered": {1: "AX-12A", 2: "AX-12A"},
+    "wheel": {1: "AX-12A"},
+    "renamed": {1: "AX-12A", 2: "MX-28"},
+    "reset": {7: "AX-12A", 8: "MX-28"},
+}
+BUSES = [
+    BusConfig(name, 1_000_000, tuple(ServoConfig(each, model, MIDDLE) for each, model in models.items()))
+    for name, models in LINES.items()
+]
 
 
-def line(name: str, *models: str) -> BusConfig:
-    servos = tuple(ServoConfig(each, model, MIDDLE) for each, model in enumerate(models, start=1))
-    return BusConfig(name, 1_000_000, servos)
-
-
-BUSES = (
-    line("read_write", "AX-12A", "MX-28"),
-    line("sync", "AX-12A", "AX-12A"),
-    line("bulk", "MX-28", "MX-28", "AX-12A"),
-    line("refused", "AX-12A", "MX-28"),
-    line("registered", "AX-12A", "AX-12A"),
-    line("wheel", "AX-12A"),
-    line("renamed", "AX-12A", "MX-28"),
-    BusConfig("reset", 1_000_000, (ServoConfig(7, "AX-12A", 2.0), ServoConfig(8, "MX-28", 2.0))),
-)
-
-
-@pytest.fixture
-def sdk() -> Any:
-    return Protocol1PacketHandler()
-
-
-def good(*results: tuple[int, int]) -> bool:
-    return all(each == (COMM_SUCCESS, 0) for each in results)
-
-
-def test_ping_tells_the_model(open_port: Any, sdk: Any) -> None:
-    port = open_port("read_write")
-    assert [sdk.ping(port, each) for each in (1, 2)] == [(AX12, COMM_SUCCESS, 0), (MX28, COMM_SUCCESS, 0)]
-    port.patience_ms = 30.0
-    assert sdk.ping(port, 3)[1] == COMM_RX_TIMEOUT
+def test_ping_tells_the_model(connect: Any) -> None:
+    host = connect("read_write")
+    assert [host.ping(each) for each in (1, 2)] == [AX12, MX28]
+    assert host.is_silent(3)
 
 
 @pytest.mark.parametrize(("servo_id", "unit"), [(1, 300 / 1023), (2, 360 / 4096)])
-def test_read_write_moves_the_servo_to_its_goal(open_port: Any, sdk: Any, servo_id: int, unit: float) -> None:
-    port = open_port("read_write")
-    assert good(sdk.write1ByteTxRx(port, servo_id, TORQUE, 1))
-    start, result, error = sdk.read2ByteTxRx(port, servo_id, PRESENT)
-    assert (result, error) == (COMM_SUCCESS, 0)
+def test_read_write_moves_the_servo_to_its_goal(connect: Any, servo_id: int, unit: float) -> None:
+    host = connect("read_write")
+    host.write(servo_id, TORQUE, 1)
+    start = host.read(servo_id, PRESENT)
     assert abs(start * unit - 150.0) < 1.0
     for goal in (start + 60, start):
-        assert good(sdk.write2ByteTxRx(port, servo_id, GOAL, goal))
-        assert until(lambda goal=goal: abs(sdk.read2ByteTxRx(port, servo_id, PRESENT)[0] - goal) <= NEAR)
-    assert good(sdk.write1ByteTxRx(port, servo_id, TORQUE, 0))
+        host.write(servo_id, GOAL, goal)
+        assert host.near(servo_id, PRESENT, goal, NEAR)
+    host.write(servo_id, TORQUE, 0)
 
 
-def test_sync_write_moves_two_servos_and_none_answers(open_port: Any, sdk: Any) -> None:
-    port = open_port("sync")
-    goals = {1: 560, 2: 470}
-    writing = GroupSyncWrite(port, sdk, GOAL, 2)
+def test_sync_write_moves_two_servos_and_none_answers(connect: Any) -> None:
+    host, goals = connect("sync"), {1: 560, 2: 470}
+    writing = GroupSyncWrite(host.port, host.sdk, *GOAL)
     assert all(writing.addParam(each, goal.to_bytes(2, "little")) for each, goal in goals.items())
     assert writing.txPacket() == COMM_SUCCESS
     for each, goal in goals.items():
-        assert until(lambda n=each, goal=goal: abs(sdk.read2ByteTxRx(port, n, PRESENT)[0] - goal) <= NEAR)
-        assert sdk.read1ByteTxRx(port, each, TORQUE) == (1, COMM_SUCCESS, 0)
+        assert host.near(each, PRESENT, goal, NEAR)
+        assert host.read(each, TORQUE) == 1
 
 
-def test_bulk_read_of_different_items(open_port: Any, sdk: Any) -> None:
-    port = open_port("bulk")
-    assert good(sdk.write1ByteTxRx(port, 2, LED, 1))
-    reading = GroupBulkRead(port, sdk)
-    assert reading.addParam(1, PRESENT, 2)
-    assert reading.addParam(2, LED, 1)
+def bulk_read(host: Any, *entries: tuple[int, Item]) -> GroupBulkRead:
+    reading = GroupBulkRead(host.port, host.sdk)
+    assert all(reading.addParam(servo_id, *item) for servo_id, item in entries)
     reading.makeParam()
-    assert sdk.bulkReadTx(port, reading.param, len(reading.param)) == COMM_SUCCESS
+    assert host.sdk.bulkReadTx(host.port, reading.param, len(reading.param)) == COMM_SUCCESS
+    return reading
+
+
+def test_bulk_read_of_different_items(connect: Any) -> None:
+    host = connect("bulk")
+    host.write(2, LED, 1)
+    reading = bulk_read(host, (1, PRESENT), (2, LED))
     assert reading.rxPacket() == COMM_SUCCESS
-    assert abs(reading.getData(1, PRESENT, 2) - 1707) <= NEAR
-    assert reading.getData(2, LED, 1) == 1
+    assert abs(reading.getData(1, *PRESENT) - 1707) <= NEAR
+    assert reading.getData(2, *LED) == 1
 
 
-def test_an_ax_does_not_know_bulk_read(open_port: Any, sdk: Any, simulation: Any) -> None:
-    port = open_port("bulk")
-    reading = GroupBulkRead(port, sdk)
-    assert reading.addParam(1, PRESENT, 2)
-    assert reading.addParam(3, PRESENT, 2)
-    reading.makeParam()
+def test_an_ax_does_not_know_bulk_read(connect: Any, simulation: Any) -> None:
+    host = connect("bulk")
     simulation.expect_refusals("bulk", 1)
-    assert sdk.bulkReadTx(port, reading.param, len(reading.param)) == COMM_SUCCESS
-    assert sdk.readRx(port, 1, 2)[1] == COMM_SUCCESS
-    port.patience_ms = 30.0
-    port.setPacketTimeout(8)
-    assert sdk.readRx(port, 3, 2)[1] == COMM_RX_TIMEOUT
+    bulk_read(host, (1, PRESENT), (3, PRESENT))
+    assert host.sdk.readRx(host.port, 1, 2)[1] == COMM_SUCCESS
+    host.port.patience_ms = 30.0
+    host.port.setPacketTimeout(8)
+    assert host.sdk.readRx(host.port, 3, 2)[1] == COMM_RX_TIMEOUT
 
 
-def test_what_the_manual_forbids_gets_its_error_bits(open_port: Any, sdk: Any, simulation: Any) -> None:
-    port = open_port("refused")
-    assert good(sdk.write2ByteTxRx(port, 2, CW_LIMIT, 100))
-    refused = {
-        "angle limit": sdk.write2ByteTxRx(port, 2, GOAL, 50),
-        "out of range": sdk.write1ByteTxRx(port, 1, LED, 2),
-        "read only": sdk.write2ByteTxRx(port, 1, PRESENT, 0),
-    }
-    simulation.expect_refusals("refused", 3)
-    words = {name: sdk.getRxPacketError(error) for name, (_, error) in refused.items()}
-    assert all(result == COMM_SUCCESS for result, _ in refused.values())
-    assert "Angle limit" in words["angle limit"]
-    assert "Out of range" in words["out of range"]
-    assert "Out of range" in words["read only"]
-    assert sdk.ping(port, 1) == (AX12, COMM_SUCCESS, 0)  # an error is told once, with its instruction
-
-
-def test_an_action_without_a_registered_write_is_an_instruction_error(
-    open_port: Any, sdk: Any, simulation: Any
-) -> None:
-    port = open_port("refused")
+def test_what_the_manual_forbids_gets_its_error_bits(connect: Any, simulation: Any) -> None:
+    host = connect("refused")
+    host.write(2, CW_LIMIT, 100)
+    assert "Angle limit" in host.refused(2, GOAL, 50)
+    assert "Out of range" in host.refused(1, LED, 2)
+    assert "Out of range" in host.refused(1, PRESENT, 0)  # read-only
+    assert host.ping(1) == AX12  # an error is told once, with its instruction
     simulation.expect_refusals("refused", 1)
-    _, result, error = sdk.txRxPacket(port, [0, 0, 1, 2, 5, 0])
+    _, result, error = host.sdk.txRxPacket(host.port, [0, 0, 1, 2, 5, 0])  # action, and nothing is registered
     assert result == COMM_SUCCESS
-    assert "Instruction code" in sdk.getRxPacketError(error)
+    assert "Instruction code" in host.sdk.getRxPacketError(error)
 
 
-def test_lock_closes_the_eeprom_until_the_power_is_cut(open_port: Any, sdk: Any, simulation: Any) -> None:
-    port = open_port("renamed")
-    assert good(sdk.write1ByteTxRx(port, 2, LOCK, 1))
-    simulation.expect_refusals("renamed", 2)
-    assert sdk.write1ByteTxRx(port, 2, RETURN_DELAY, 100)[1] != 0
-    assert sdk.write1ByteTxRx(port, 2, LOCK, 0)[1] != 0
-    assert good(sdk.write1ByteTxRx(port, 2, LED, 1))
+def test_lock_closes_the_eeprom_until_the_power_is_cut(connect: Any) -> None:
+    host = connect("renamed")
+    host.write(2, LOCK, 1)
+    assert host.refused(2, RETURN_DELAY, 100)
+    assert host.refused(2, LOCK, 0)
+    host.write(2, LED, 1)
 
 
-def test_registered_writes_happen_at_the_action_of_all(open_port: Any, sdk: Any) -> None:
-    port = open_port("registered")
-    assert good(*(sdk.regWriteTxRx(port, each, LED, 1, [1]) for each in (1, 2)))
-    assert [sdk.read1ByteTxRx(port, each, LED)[0] for each in (1, 2)] == [0, 0]
-    assert [sdk.read1ByteTxRx(port, each, REGISTERED)[0] for each in (1, 2)] == [1, 1]
-    assert sdk.action(port, BROADCAST) == COMM_SUCCESS
-    assert [sdk.read1ByteTxRx(port, each, LED)[0] for each in (1, 2)] == [1, 1]
-    assert [sdk.read1ByteTxRx(port, each, REGISTERED)[0] for each in (1, 2)] == [0, 0]
+def test_registered_writes_happen_at_the_action_of_all(connect: Any) -> None:
+    host = connect("registered")
+    for each in (1, 2):
+        assert host.sdk.regWriteTxRx(host.port, each, *LED, [1]) == (COMM_SUCCESS, 0)
+    for led in (0, 1):
+        assert [host.read(each, LED) for each in (1, 2)] == [led] * 2
+        assert [host.read(each, REGISTERED) for each in (1, 2)] == [1 - led] * 2
+        if not led:
+            assert host.sdk.action(host.port, 0xFE) == COMM_SUCCESS
 
 
-def test_both_angle_limits_at_zero_make_a_wheel(open_port: Any, sdk: Any) -> None:
-    port = open_port("wheel")
-    assert good(sdk.write2ByteTxRx(port, 1, CW_LIMIT, 0), sdk.write2ByteTxRx(port, 1, CCW_LIMIT, 0))
-    assert good(sdk.write1ByteTxRx(port, 1, TORQUE, 1))
+def test_both_angle_limits_at_zero_make_a_wheel(connect: Any) -> None:
+    host = connect("wheel")
+    for item, value in ((CW_LIMIT, 0), (CCW_LIMIT, 0), (TORQUE, 1)):
+        host.write(1, item, value)
     for clockwise in (0, 1 << 10):
-        assert good(sdk.write2ByteTxRx(port, 1, SPEED, 300 | clockwise))
-        turning = range(clockwise + 150, clockwise + 450)
-        assert until(lambda turning=turning: sdk.read2ByteTxRx(port, 1, PRESENT_SPEED)[0] in turning)
-    assert good(sdk.write2ByteTxRx(port, 1, SPEED, 0), sdk.write1ByteTxRx(port, 1, TORQUE, 0))
+        host.write(1, SPEED, 300 | clockwise)
+        assert host.near(1, PRESENT_SPEED, clockwise + 300, 150)
+    host.write(1, SPEED, 0)
+    host.write(1, TORQUE, 0)
 
 
-def test_a_new_id_answers_where_the_old_one_is_silent(open_port: Any, sdk: Any) -> None:
-    port = open_port("renamed")
-    assert good(sdk.write1ByteTxRx(port, 1, ID, 200))
-    assert sdk.ping(port, 200) == (AX12, COMM_SUCCESS, 0)
-    port.patience_ms = 30.0
-    assert sdk.ping(port, 1)[1] == COMM_RX_TIMEOUT
-    port.patience_ms = DEADLINE_S * 1000
-    assert good(sdk.write1ByteTxRx(port, 200, ID, 1))
+def test_a_new_id_answers_where_the_old_one_is_silent(connect: Any) -> None:
+    host = connect("renamed")
+    host.write(1, ID, 200)
+    assert host.ping(200) == AX12
+    assert host.is_silent(1)
+    host.write(200, ID, 1)
 
 
-def test_factory_reset_answers_as_before_and_is_the_maker_s_servo_after(open_port: Any, sdk: Any) -> None:
-    port = open_port("reset")
-    assert good(sdk.write1ByteTxRx(port, 7, RETURN_DELAY, 0))
-    assert good(sdk.factoryReset(port, 7))
-    assert until(lambda: sdk.ping(port, 1)[0] == AX12)  # e-Manual, AX-12A: ID 1, 1 Mbit/s
-    assert sdk.read1ByteTxRx(port, 1, RETURN_DELAY) == (250, COMM_SUCCESS, 0)
-    assert good(sdk.factoryReset(port, 8))
-    assert port.setBaudRate(57_600)
-    assert until(lambda: sdk.ping(port, 1)[0] == MX28)  # e-Manual, MX-28: ID 1, 57,600 bit/s
-    assert sdk.read1ByteTxRx(port, 1, BAUD_RATE) == (34, COMM_SUCCESS, 0)
+def test_factory_reset_answers_as_before_and_is_the_maker_s_servo_after(connect: Any) -> None:
+    host = connect("reset")
+    host.write(7, RETURN_DELAY, 0)
+    assert host.sdk.factoryReset(host.port, 7) == (COMM_SUCCESS, 0)
+    assert until(lambda: host.sdk.ping(host.port, 1)[0] == AX12)  # e-Manual, AX-12A: ID 1, 1 Mbit/s
+    assert host.read(1, RETURN_DELAY) == 250
+    assert host.sdk.factoryReset(host.port, 8) == (COMM_SUCCESS, 0)
+    assert host.port.setBaudRate(57_600)
+    assert until(lambda: host.sdk.ping(host.port, 1)[0] == MX28)  # e-Manual, MX-28: ID 1, 57,600 bit/s
+    assert host.read(1, BAUD_RATE) == 34

@@ -10,12 +10,14 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import pytest
-from dynamixel_sdk import COMM_SUCCESS, GroupSyncRead, GroupSyncWrite, Protocol2PacketHandler
+from dynamixel_sdk import COMM_SUCCESS, GroupSyncRead, GroupSyncWrite
+from tests.foreign.conftest import Item
 from tests.kit.awaited import until
 
 from dxlsim.simulation_plan import BusConfig, ServoConfig
 from dxlwire.control_table import ControlItem, find_table
 
+PROTOCOL = 2.0
 LEADER = dict.fromkeys(range(1, 7), "XL330-M077")
 FOLLOWER = {1: "XL430-W250", 2: "XL430-W250", **dict.fromkeys(range(3, 7), "XL330-M288")}
 GRIPPER = 6
@@ -36,24 +38,20 @@ BUSES = (
 class Arm:
     """What such a framework knows of an arm: items by name, values as integers, one call for all servos."""
 
-    def __init__(self, port: Any, models: Mapping[int, str]) -> None:
-        self.models = models
-        self._port = port
-        self._sdk = Protocol2PacketHandler()
-        self._reader = GroupSyncRead(port, self._sdk, 0, 0)
-        self._writer = GroupSyncWrite(port, self._sdk, 0, 0)
+    def __init__(self, host: Any, models: Mapping[int, str]) -> None:
+        self.models, self.host = models, host
+        self._reader = GroupSyncRead(host.port, host.sdk, 0, 0)
+        self._writer = GroupSyncWrite(host.port, host.sdk, 0, 0)
 
     def greet(self) -> dict[int, int]:
-        return {each: self._sdk.ping(self._port, each)[0] for each in self.models}
+        return {each: self.host.ping(each) for each in self.models}
 
     def item(self, name: str, servo_id: int) -> ControlItem:
         return find_table(self.models[servo_id], 2.0).items[name]
 
     def write(self, name: str, servo_id: int, value: int) -> None:
         item = self.item(name, servo_id)
-        data = list((value % (1 << 8 * item.size)).to_bytes(item.size, "little"))
-        result = self._sdk.writeTxRx(self._port, servo_id, item.address, item.size, data)
-        assert result == (COMM_SUCCESS, 0), (name, servo_id, value)
+        self.host.write(servo_id, Item(item.address, item.size), value % (1 << 8 * item.size))
 
     def read_all(self, name: str) -> dict[int, int]:
         item = self.item(name, 1)
@@ -91,26 +89,23 @@ class Arm:
 
 
 @pytest.fixture
-def connect(open_port: Any) -> Callable[[str], Arm]:
-    return lambda name: Arm(open_port(name), LEADER if name.startswith("leader") else FOLLOWER)
+def connect_arm(connect: Any) -> Callable[[str], Arm]:
+    return lambda name: Arm(connect(name), LEADER if name.startswith("leader") else FOLLOWER)
 
 
 @pytest.mark.parametrize("name", ["leader", "follower"])
-def test_every_servo_of_an_arm_is_of_the_model_that_was_promised(connect: Any, name: str) -> None:
-    held = connect(name)
+def test_an_arm_has_the_promised_models_and_its_pose_becomes_the_middle_of_its_joints(
+    connect_arm: Any, name: str
+) -> None:
+    held = connect_arm(name)
     assert held.greet() == {each: find_table(model, 2.0).model_number for each, model in held.models.items()}
-
-
-@pytest.mark.parametrize("name", ["leader", "follower"])
-def test_the_pose_of_an_arm_becomes_the_middle_of_its_joints(connect: Any, name: str) -> None:
-    held = connect(name)
     held.configure()
     held.centre()
     assert all(abs(position - 2047) <= 1 for position in held.read_all("present_position").values())
 
 
-def test_a_follower_goes_where_its_leader_is(connect: Any) -> None:
-    leader, follower = connect("leader again"), connect("follower again")
+def test_a_follower_goes_where_its_leader_is(connect_arm: Any) -> None:
+    leader, follower = connect_arm("leader again"), connect_arm("follower again")
     for each in (leader, follower):
         each.configure()
     start = follower.read_all("present_position")
@@ -133,10 +128,11 @@ def test_a_follower_goes_where_its_leader_is(connect: Any) -> None:
     assert set(follower.read_all("torque_enable").values()) == {0}
 
 
-def test_what_was_configured_is_there_for_the_next_connection(connect: Any, open_port: Any) -> None:
-    connect("follower apart").configure()
-    open_port.close()
-    again = connect("follower apart")
+def test_what_was_configured_is_there_for_the_next_connection(connect_arm: Any) -> None:
+    first = connect_arm("follower apart")
+    first.configure()
+    first.host.port.closePort()
+    again = connect_arm("follower apart")
     assert set(again.read_all("return_delay_time").values()) == {0}
     modes = {**dict.fromkeys(FOLLOWER, EXTENDED_POSITION), GRIPPER: CURRENT_BASED_POSITION}
     assert again.read_all("operating_mode") == modes

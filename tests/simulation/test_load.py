@@ -7,6 +7,7 @@ import math
 import pytest
 import serial
 from tests.kit.bodies import Turned, bodies_of
+from tests.kit.bus_process import BusProcess
 from tests.kit.packets import packet2
 from tests.kit.simulated_line import Line
 
@@ -92,17 +93,16 @@ def test_both_ways_of_moving_show_the_host_the_same():
     assert alone > START + 500
 
 
-def test_the_process_of_simulated_buses_moves_bodies(start_buses):
+def test_the_process_of_simulated_buses_moves_bodies():
     pytest.importorskip("mujoco")
     bodies = bodies_of(URDF, (Turned("shoulder", START * TICK, -1),))
     bus = BusConfig("main", 1_000_000, (ServoConfig(1, "XM430-W350", START * TICK),), 2.0)
-    running = start_buses(SimulationConfig((bus,), bodies=bodies))
+    config = SimulationConfig((bus,), bodies=bodies)
     read = packet2(1, 0x02, bytes.fromhex("8400 0400"))  # present position
-    with serial.Serial(running.ports["main"], 1_000_000, timeout=20) as port:
+    with BusProcess(config) as process, serial.Serial(process.ports["main"], 1_000_000, timeout=20) as port:
         for _ in range(20_000):  # limp, it falls within a second, however busy the machine
             port.write(read)
             position = int.from_bytes(port.read(15)[9:13], "little", signed=True)
             if position < START - 500:
                 break
     assert position < START - 500
-    assert running.hang_up() == 0

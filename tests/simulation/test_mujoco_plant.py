@@ -19,28 +19,39 @@ from dxlsim.motion.plant import IndependentJoints, Plant, PlantJoint
 from dxlsim.simulation_plan import NO_LOAD, Load
 
 RUBBING = msgspec.structs.replace(ROTOR, friction=0.05, load_friction=0.1, viscous_friction=0.01)
-
-
 ONE = urdf(link("arm"), joint("shoulder", "base", "arm"))
 FLAT = urdf(link("arm"), joint("shoulder", "base", "arm", axis="0 0 1"))
 TWO = urdf(link("upper"), link("lower"), joint("shoulder", "base", "upper"), joint("elbow", "upper", "lower"))
+SHOULDER, ELBOW = Turned("shoulder", 0.0, 1), Turned("elbow", 0.0, 1)
+physics = pytest.mark.needs("physics")
 
 
-def _plant(
-    text: str, *joints: Turned, angles: Sequence[float] = (), load: Load = NO_LOAD, rotor: Motor = ROTOR
+def plant_of(
+    text: str,
+    *joints: Turned,
+    angles: Sequence[float] = (),
+    load: Load = NO_LOAD,
+    rotor: Motor = ROTOR,
 ) -> Plant:
+    joints = joints or (SHOULDER,)
     placed = [angles[row] if angles else joint.reference for row, joint in enumerate(joints)]
     return mujoco_plant(bodies_of(text, joints))([PlantJoint(rotor, load, angle) for angle in placed])
 
 
-@pytest.mark.needs("physics")
+def is_held(plant: Plant, drive: float | list[float], within: float = 1e-6) -> bool:
+    """Return whether the shafts stay where they are."""
+    before = plant.angle.copy()
+    run(plant, 1.0, drive=drive, damping=0.5)
+    return bool(np.abs(plant.angle - before).max() <= within)
+
+
+@physics
 @pytest.mark.parametrize("rotor", [ROTOR, RUBBING], ids=["free", "rubbing"])
 def test_a_joint_without_weight_moves_as_an_independent_one(rotor):
     load = Load(inertia=MASS * ARM**2, friction=0.05)
-    bodies = _plant(FLAT, Turned("shoulder", 0.0, 1), load=load, rotor=rotor)
+    bodies = plant_of(FLAT, load=load, rotor=rotor)
     alone = IndependentJoints([PlantJoint(rotor, load, 0.0)])
-    rng = np.random.default_rng(3)
-    ways = []
+    rng, ways = np.random.default_rng(3), []
     for _ in range(200):
         drive, damping = rng.uniform(-1, 1, 1), rng.uniform(0, 0.5, 1)
         for _ in range(25):
@@ -52,131 +63,101 @@ def test_a_joint_without_weight_moves_as_an_independent_one(rotor):
     assert np.abs(moved - expected).max() < 0.01 * np.ptp(expected)
 
 
-@pytest.mark.needs("physics")
-def test_a_joint_with_weight_swings_as_an_independent_one():
+@physics
+def test_a_joint_with_weight_swings_as_an_independent_one_and_ends_hanging_down():
     load = Load(inertia=MASS * ARM**2, gravity=PULL, gravity_angle=-math.pi / 2)
-    bodies = _plant(ONE, Turned("shoulder", 0.0, 1))
-    alone = IndependentJoints([PlantJoint(ROTOR, load, 0.0)])
+    bodies, alone = plant_of(ONE), IndependentJoints([PlantJoint(ROTOR, load, 0.0)])
     run(bodies, 0.5, damping=0.02)
     run(alone, 0.5, damping=0.02)
     assert alone.angle[0] < -math.pi / 2, "it swung past the bottom, beyond the limit that is drawn"
     assert bodies.angle[0] == pytest.approx(alone.angle[0], abs=0.02)
+    run(bodies, 10.0, damping=0.3)
+    assert bodies.angle[0] == pytest.approx(-math.pi / 2, abs=1e-3)
 
 
-@pytest.mark.needs("physics")
-def test_a_limp_arm_ends_hanging_down():
-    plant = _plant(ONE, Turned("shoulder", 0.0, 1))
-    run(plant, 10.0, damping=0.3)
-    assert plant.angle[0] == pytest.approx(-math.pi / 2, abs=1e-3)
-
-
-@pytest.mark.needs("physics")
+@physics
 @pytest.mark.parametrize(("reference", "direction"), [(0.0, 1), (2.5, 1), (2.5, -1), (-1.0, -1)])
 @pytest.mark.parametrize("angle", [0.0, 0.7, -2.0])
 def test_an_arm_is_held_by_its_weight_times_its_lever(reference, direction, angle):
     servo_angle = reference + direction * angle
-    plant = _plant(ONE, Turned("shoulder", reference, direction), angles=[servo_angle])
-    run(plant, 1.0, drive=direction * PULL * math.cos(angle), damping=0.5)
-    assert plant.angle[0] == pytest.approx(servo_angle, abs=1e-6)
+    plant = plant_of(ONE, Turned("shoulder", reference, direction), angles=[servo_angle])
+    assert is_held(plant, direction * PULL * math.cos(angle))
     run(plant, 0.2, drive=direction * PULL * math.cos(angle) + 0.1, damping=0.5)
     assert plant.angle[0] > servo_angle + 0.01, "a positive torque turns a servo counter-clockwise"
 
 
-@pytest.mark.needs("physics")
+@physics
 def test_friction_holds_what_it_can_hold():
-    holding = _plant(ONE, Turned("shoulder", 0.0, 1), load=Load(friction=1.1 * PULL))
+    holding = plant_of(ONE, load=Load(friction=1.1 * PULL))
     run(holding, 10.0)
     assert holding.angle[0] == pytest.approx(0.0, abs=0.002)
-    slipping = _plant(ONE, Turned("shoulder", 0.0, 1), load=Load(friction=0.9 * PULL))
+    slipping = plant_of(ONE, load=Load(friction=0.9 * PULL))
     run(slipping, 2.0)
     assert slipping.angle[0] < -0.05
 
 
-@pytest.mark.parametrize(
-    "bodies",
-    [
-        pytest.param(True, id="bodies", marks=pytest.mark.needs("physics")),
-        pytest.param(False, id="independent"),
-    ],
-)
+@pytest.mark.parametrize("bodies", [pytest.param(True, id="bodies", marks=physics), False])
 @pytest.mark.parametrize(("pulled", "falls"), [(0.25, False), (0.35, True)])
 def test_friction_of_the_gear_grows_with_what_pulls_at_it(pulled, falls, bodies):
     gear = msgspec.structs.replace(ROTOR, load_friction=0.2)
     # held with 1 - p of the pull: friction is 0.2 of the sum of both, which the difference must not exceed
     plant: Plant = IndependentJoints([PlantJoint(gear, Load(MASS * ARM**2, 0.0, PULL, -math.pi / 2), 0.0)])
     if bodies:
-        plant = _plant(ONE, Turned("shoulder", 0.0, 1), rotor=gear)
+        plant = plant_of(ONE, rotor=gear)
     run(plant, 2.0, drive=(1 - pulled) * PULL, damping=0.05)
     assert (plant.angle[0] < -0.05) == falls
 
 
-@pytest.mark.needs("physics")
+@physics
 def test_damping_and_friction_of_the_urdf_are_added():
     rubbed = FLAT.replace("</joint>", '<dynamics damping="0.3" friction="0.2"/></joint>')
-    bodies = _plant(rubbed, Turned("shoulder", 0.0, 1), load=Load(friction=0.1))
+    bodies = plant_of(rubbed, load=Load(friction=0.1))
     run(bodies, 3.0, drive=0.5, damping=0.1)
     assert bodies.velocity[0] == pytest.approx((0.5 - 0.2 - 0.1) / (0.3 + 0.1), rel=0.01)
 
 
-@pytest.mark.needs("physics")
-def test_the_shoulder_feels_what_the_elbow_does():
-    joints = (Turned("shoulder", 0.0, 1), Turned("elbow", 0.0, 1))
+@physics
+def test_the_shoulder_feels_what_the_elbow_does_and_joints_are_known_by_name():
     # both links stretched out: the lower weight hangs on two levers
-    shoulder, elbow = PULL + 2 * PULL, PULL
-    stretched = _plant(TWO, *joints)
-    run(stretched, 1.0, drive=[shoulder, elbow], damping=0.5)
-    assert stretched.angle == pytest.approx([0.0, 0.0], abs=1e-6)
-    folded = _plant(TWO, *joints, angles=[0.0, math.pi / 2])
-    run(folded, 1.0, drive=[PULL + PULL, 0.0], damping=0.5)
-    assert folded.angle == pytest.approx([0.0, math.pi / 2], abs=1e-6)
+    assert is_held(plant_of(TWO, SHOULDER, ELBOW), [PULL + 2 * PULL, PULL])
+    assert is_held(plant_of(TWO, SHOULDER, ELBOW, angles=[0.0, math.pi / 2]), [PULL + PULL, 0.0])
+    assert is_held(plant_of(TWO, Turned("elbow", 1.0, -1), Turned("shoulder", 3.0, 1)), [-PULL, 3 * PULL])
 
 
-@pytest.mark.needs("physics")
-def test_servos_are_distinguished_by_their_joints_names():
-    plant = _plant(TWO, Turned("elbow", 1.0, -1), Turned("shoulder", 3.0, 1))
-    run(plant, 1.0, drive=[-PULL, 3 * PULL], damping=0.5)
-    assert plant.angle == pytest.approx([1.0, 3.0], abs=1e-6)
-
-
-@pytest.mark.needs("physics")
-def test_what_the_urdf_does_not_turn_moves_by_itself_and_what_no_servo_turns_rests():
+@physics
+def test_what_the_urdf_does_not_turn_moves_alone_and_what_no_servo_turns_rests():
     text = urdf(
         link("upper"), link("lower"), link("finger"), joint("shoulder", "base", "upper"),
         joint("elbow", "upper", "lower"),
         joint("grip", "lower", "finger", kind="prismatic", more='<mimic joint="elbow" multiplier="2"/>'),
     )  # fmt: skip
-    joints = (Turned("grip", 0.5, 1), Turned("shoulder", 0.0, 1), Turned("nowhere", 1.5, 1))
-    plant = _plant(text, *joints)
-    three_links = PULL * (1 + 2 + 3)
-    run(plant, 1.0, drive=[0.0, three_links, 0.02], damping=0.5)
+    plant = plant_of(text, Turned("grip", 0.5, 1), SHOULDER, Turned("nowhere", 1.5, 1))
+    run(plant, 1.0, drive=[0.0, PULL * (1 + 2 + 3), 0.02], damping=0.5)
     assert plant.angle[:2] == pytest.approx([0.5, 0.0], abs=1e-6)
     alone = IndependentJoints([PlantJoint(ROTOR, NO_LOAD, 1.5)])
     run(alone, 1.0, drive=0.02, damping=0.5)
     assert plant.angle[2] == alone.angle[0] > 1.5
 
 
-@pytest.mark.needs("physics")
-def test_a_joint_with_a_servo_of_its_own_mimics_nojoint():
+@physics
+def test_a_joint_with_a_servo_of_its_own_mimics_no_joint():
     mimic = TWO.replace('name="elbow"', 'name="wrist"').replace(
         "</joint></robot>", '<mimic joint="shoulder" multiplier="1"/></joint></robot>'
     )
-    plant = _plant(mimic, Turned("shoulder", 0.0, 1), Turned("wrist", 0.0, 1), angles=[0.0, math.pi / 2])
-    run(plant, 1.0, drive=[2 * PULL, 0.0], damping=0.5)
-    assert plant.angle == pytest.approx([0.0, math.pi / 2], abs=1e-6)
+    plant = plant_of(mimic, SHOULDER, Turned("wrist", 0.0, 1), angles=[0.0, math.pi / 2])
+    assert is_held(plant, [2 * PULL, 0.0])
 
 
-@pytest.mark.needs("physics")
-def test_a_servo_that_is_added_later_moves_by_itself():
-    make = mujoco_plant(bodies_of(ONE, (Turned("shoulder", 0.0, 1),)))
+@physics
+def test_a_servo_that_is_added_later_moves_alone():
+    make = mujoco_plant(bodies_of(ONE, (SHOULDER,)))
     assert len(make(()).angle) == 0
-    plant = make([PlantJoint(ROTOR, NO_LOAD, 0.0), PlantJoint(ROTOR, NO_LOAD, 2.0)])
-    run(plant, 1.0, drive=[PULL, 0.0], damping=0.1)
-    assert plant.angle == pytest.approx([0.0, 2.0], abs=1e-6)
+    assert is_held(make([PlantJoint(ROTOR, NO_LOAD, 0.0), PlantJoint(ROTOR, NO_LOAD, 2.0)]), [PULL, 0.0])
 
 
-@pytest.mark.needs("physics")
+@physics
 def test_a_joint_is_placed_at_rest():
-    plant = _plant(ONE, Turned("shoulder", 0.0, 1))
+    plant = plant_of(ONE)
     run(plant, 0.2)
     assert plant.velocity[0] < -1
     plant.place_shaft(0, -math.pi / 2)
@@ -184,17 +165,17 @@ def test_a_joint_is_placed_at_rest():
     assert plant.angle[0] == pytest.approx(-math.pi / 2, abs=1e-9)
 
 
-@pytest.mark.needs("physics")
+@physics
 def test_two_runs_are_the_same_to_the_last_bit():
-    def once() -> list[float]:
-        plant = _plant(TWO, Turned("shoulder", 0.0, 1), Turned("elbow", 0.0, -1), load=Load(friction=0.1))
+    runs = []
+    for _ in range(2):
+        plant = plant_of(TWO, SHOULDER, Turned("elbow", 0.0, -1), load=Load(friction=0.1))
         run(plant, 2.0, drive=[0.3, -0.2], damping=0.03)
-        return [*plant.angle, *plant.velocity]
+        runs.append([*plant.angle, *plant.velocity])
+    assert runs[0] == runs[1]
 
-    assert once() == once()
 
-
-@pytest.mark.needs("physics")
+@physics
 def test_missing_meshes_and_pictures_are_no_error():
     mesh = '<geometry><mesh filename="package://no_package/has/this.stl"/></geometry>'
     shapes = f"<visual>{mesh}</visual><collision>{mesh}</collision>"
@@ -205,56 +186,46 @@ def test_missing_meshes_and_pictures_are_no_error():
         joint("shoulder", "base", "arm"),
         joint("wrist", "arm", "hand"),
     )
-    plant = _plant(text, Turned("shoulder", 0.0, 1), Turned("wrist", 0.0, 1))
-    run(plant, 1.0, drive=[PULL, 0.0], damping=0.5)
-    assert plant.angle == pytest.approx([0.0, 0.0], abs=1e-4)
+    assert is_held(plant_of(text, SHOULDER, Turned("wrist", 0.0, 1)), [PULL, 0.0], 1e-4)
 
 
-@pytest.mark.needs("physics")
+@physics
 def test_a_link_that_only_has_a_shape_weighs_as_water_does():
     box = '<collision><origin xyz="0.1 0 0"/><geometry><box size="0.1 0.1 0.05"/></geometry></collision>'
-    plant = _plant(
-        urdf(f'<link name="arm">{box}</link>', joint("shoulder", "base", "arm")),
-        Turned("shoulder", 0.0, 1),
-    )
-    run(plant, 1.0, drive=1000 * 0.1 * 0.1 * 0.05 * 9.81 * 0.1, damping=0.5)
-    assert plant.angle[0] == pytest.approx(0.0, abs=1e-6)
+    plant = plant_of(urdf(f'<link name="arm">{box}</link>', joint("shoulder", "base", "arm")))
+    assert is_held(plant, 1000 * 0.1 * 0.1 * 0.05 * 9.81 * 0.1)
 
 
-@pytest.mark.needs("physics")
+@physics
 def test_the_torso_moves():
     text = (Path(__file__).parents[2] / "robots" / "urdf/bioloid_torso.urdf").read_text("utf-8")
-    joints = (Turned("left_shoulder_swing_joint", 1.0, -1), Turned("head_yaw_joint", 2.6, 1))
-    plant = _plant(text, *joints)
+    plant = plant_of(text, Turned("left_shoulder_swing_joint", 1.0, -1), Turned("head_yaw_joint", 2.6, 1))
     run(plant, 0.5, drive=[0.0, 0.0], damping=0.01)
     assert np.isfinite(plant.angle).all()
 
 
-@pytest.mark.needs("physics")
+NAMES = "hinges of the URDF and joints of the robot file have different names; use"
+
+
+@physics
 @pytest.mark.parametrize(
-    ("text", "sentence"),
+    ("right", "wrong", "sentence"),
     [
-        (ONE.replace('<parent link="base"/>', ""), "MuJoCo cannot load the URDF: "),
-        (ONE.replace("</robot>", ""), "MuJoCo cannot load the URDF: "),
-        (
-            ONE.replace("shoulder", "schulter"),
-            "hinges of the URDF and joints of the robot file have different names; use",
-        ),
-        (
-            ONE.replace("revolute", "fixed"),
-            "hinges of the URDF and joints of the robot file have different names; use",
-        ),
+        ('<parent link="base"/>', "", "MuJoCo cannot load the URDF: "),
+        ("</robot>", "", "MuJoCo cannot load the URDF: "),
+        ("shoulder", "schulter", NAMES),
+        ("revolute", "fixed", NAMES),
     ],
 )
-def test_a_urdf_that_cannot_be_moved_is_reported_in_a_sentence(text, sentence):
+def test_a_urdf_that_cannot_be_moved_is_reported_in_a_sentence(right, wrong, sentence):
     with pytest.raises(InputError, match=sentence) as caught:
-        mujoco_plant(bodies_of(text, (Turned("shoulder", 0.0, 1),)))
+        mujoco_plant(bodies_of(ONE.replace(right, wrong), (SHOULDER,)))
     assert len(caught.value.sentences) == 1
 
 
-@pytest.mark.needs("physics")
+@physics
 def test_a_hand_turns_a_body_evenly():
-    mechanics = Mechanics(0, mujoco_plant(bodies_of(ONE, (Turned("shoulder", 0.0, 1),))))
+    mechanics = Mechanics(0, mujoco_plant(bodies_of(ONE, (SHOULDER,))))
     mechanics.add_servo(ROTOR, NO_LOAD, 0.0)
     mechanics.turn_shaft(0, 0.5, 1_000_000_000, lambda turned: pytest.fail("nothing drives it"))
     mechanics.step_to(500_000_000)

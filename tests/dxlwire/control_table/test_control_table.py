@@ -1,3 +1,5 @@
+"""Items of a control table: units, ticks and bytes; and what is wrong with a data file."""
+
 from __future__ import annotations
 
 import math
@@ -9,12 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import dxlwire.control_table
-from dxlwire.control_table import ControlItem, find_table, model_names, read_control_table
+from dxlwire.control_table import ControlItem, find_table, read_control_table
 
 AX = find_table("AX-12A")
-AX_TEXT = (Path(dxlwire.control_table.__file__).parent / "tables" / "protocol1" / "AX-12A.toml").read_text(
-    "utf-8"
-)
+AX_TEXT = (Path(dxlwire.control_table.__file__).parent / "tables/protocol1/AX-12A.toml").read_text("utf-8")
 
 
 def test_the_model_number_is_that_of_a_foreign_list() -> None:
@@ -22,43 +22,26 @@ def test_the_model_number_is_that_of_a_foreign_list() -> None:
     assert AX.items["model_number"].initial == AX.model_number
 
 
-def test_position_unit_is_exact_and_not_the_rounded_one_of_the_manual() -> None:
+def test_units_are_exact_and_not_the_rounded_ones_of_the_manual() -> None:
     assert math.degrees(AX.rad_per_tick) == pytest.approx(300 / 1023, rel=1e-15)
     assert math.degrees(AX.rad_per_tick * AX.max_tick) == pytest.approx(300, rel=1e-15)
-
-
-def test_units_of_speed_load_voltage_temperature_and_delay() -> None:
     assert AX.rad_s_per_tick == pytest.approx(0.111 * 2 * math.pi / 60, rel=1e-15)
     assert AX.max_speed == pytest.approx(59 * 2 * math.pi / 60, rel=1e-15)
-    assert AX.effort_per_tick == 1 / 1023
-    units = {name: (AX.items[name].unit, AX.items[name].scale) for name in AX.items}
-    assert units["present_voltage"] == ("V", 0.1)
-    assert units["present_temperature"] == ("degC", 1.0)
-    assert units["return_delay_time"] == ("s", 2e-6)
-    assert units["goal_position"] == ("rad", AX.rad_per_tick)
-    assert units["torque_enable"] == ("", 1.0)
-
-
-def test_speed_at_the_highest_tick_is_what_the_manual_prints() -> None:
     rpm = AX.max_speed_tick * AX.rad_s_per_tick * 60 / (2 * math.pi)
     assert round(rpm) == 114  # e-Manual, Moving Speed (32): "If it is 1023, it is about 114rpm"
-
-
-def test_the_aliases_name_the_same_table() -> None:
-    assert model_names() == tuple(sorted(model_names()))
-    assert {"AX-12", "AX-12+", "AX-12A"} <= set(model_names())
-    assert find_table("AX-12") is AX
-    assert find_table("AX-12+").model == "AX-12A"
-
-
-def test_an_unknown_model_is_named_with_those_that_are_known() -> None:
-    with pytest.raises(LookupError, match=r"'AX-13'.*AX-12A"):
-        find_table("AX-13")
+    assert AX.effort_per_tick == 1 / 1023
+    units = {
+        "present_voltage": ("V", 0.1),
+        "present_temperature": ("degC", 1.0),
+        "return_delay_time": ("s", 2e-6),
+        "goal_position": ("rad", AX.rad_per_tick),
+        "torque_enable": ("", 1.0),
+    }
+    assert {name: (AX.items[name].unit, AX.items[name].scale) for name in units} == units
 
 
 @pytest.mark.parametrize(
-    ("ticks", "data"),
-    [(0, "0000"), (1, "0100"), (1023, "ff03"), (-1, "0104"), (-1023, "ff07")],
+    ("ticks", "data"), [(0, "0000"), (1, "0100"), (1023, "ff03"), (-1, "0104"), (-1023, "ff07")]
 )
 def test_direction_is_bit_10(ticks: int, data: str) -> None:
     assert AX.items["present_speed"].encode(ticks) == bytes.fromhex(data)
@@ -92,11 +75,7 @@ def test_a_reply_of_the_wrong_length_is_refused() -> None:
         ("address = 3,", "address = 2,", "id: address 2 overlaps the previous item"),
         ("maximum = 253", "maximum = 256", "id: 0..256 does not fit"),
         ("initial = 250", "initial = 255", "return_delay_time: the initial value 255"),
-        (
-            'encoding = "unsigned"',
-            'encoding = "gray"',
-            "model_number: encoding: Invalid enum value 'gray'; known are unsigned",
-        ),
+        ('"unsigned"', '"gray"', "model_number: encoding: Invalid enum value 'gray'; known are unsigned"),
         ("address = 5,", 'address = "5",', "return_delay_time: address: Expected `int`, got `str`"),
         ("size = 2", "size = 3", "model_number: the size must be 1, 2 or 4, not 3"),
         ("59 rpm", "59 turns", "the unit is not one of"),
@@ -109,9 +88,8 @@ def test_a_broken_data_file_is_refused(old: str, new: str, complaint: str) -> No
 
 
 def test_items_of_devices_have_integers_bytes_and_values() -> None:
-    signed = ControlItem(
-        "x", 0, 2, "RW", "RAM", -1023, 1023, None, "sign_magnitude", "m", 0.5, "", offset=3.0
-    )
+    meters = "sign_magnitude", "m", 0.5, ""
+    signed = ControlItem("x", 0, 2, "RW", "RAM", -1023, 1023, None, *meters, offset=3.0)
     assert signed.wire_bytes(-5) == b"\x05\x04"
     assert (signed.integer(b"\x05\x04"), signed.value(b"\x05\x04")) == (-5, 0.5)
     button = ControlItem("b", 0, 1, "R", "RAM", 0, 255, None, "unsigned", "", 1.0, "", bit=2)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import re
 import struct
 import tomllib
+from pathlib import Path
 
 import pytest
 
@@ -17,23 +19,8 @@ from dxlwire.control_table.device_models import (
 )
 from dxlwire.control_table.device_table import read_device_table
 
-BOARD = """\
-kind = "device"
-model = "Board-1"
-aliases = ["BOARD"]
-model_number = 60_001
-protocol = 2.0
-capabilities = ["sync_read"]
-cyclic = ["pressure", "start", "stop", "yaw"]
-
-[items]
-model_number = {address = 0, size = 2, area = "EEPROM"}
-lamp = {address = 20, size = 1, access = "RW", minimum = 0, maximum = 7, initial = 0, safe = 0}
-start = {address = 30, size = 1, bit = 0, state = "button.start"}
-stop = {address = 30, size = 1, bit = 3, state = "button.stop"}
-pressure = {address = 31, size = 2, tick = "-0.1 mN", offset = "2 N", state = "force.z"}
-yaw = {address = 36, size = 4, encoding = "float32", tick = "1 rad", state = "orientation.z"}
-"""
+TEXT = Path(__file__).with_name("device_mistakes.txt").read_text("utf-8")
+BOARD, CASES = TEXT.partition("\n")[2].split("====\n")
 
 
 @pytest.fixture(autouse=True)
@@ -61,76 +48,34 @@ def test_a_table_without_a_model_number_is_one_that_is_not_checked() -> None:
     assert table.model_number is None
 
 
-@pytest.mark.parametrize(
-    ("before", "after", "sentence"),
-    [
-        ('kind = "device"\n', "", 'kind must be "device"'),
-        ("protocol = 2.0", "protocol = 2", "protocol must be 1.0 or 2.0, not 2"),
-        ('["sync_read"]', '["sync_raed"]', "capabilities not allowed for a device: sync_raed"),
-        ('["pressure", ', '["presure", ', "cyclic: unknown item presure"),
-        ("address = 31", "address = 30", "pressure: address 30 overlaps st"),
-        ("bit = 3", "bit = 0", "bit 0 of address 30 is defined twice"),
-        ("bit = 3", "bit = 8", "stop: the bit must be 0..7, not 8"),
-        ("size = 1, bit = 3", 'size = 1, access = "RW", bit = 3', "stop: a bit must be unsigned, read-only"),
-        (
-            'tick = "-0.1 mN"',
-            'tick = "0.1 lbf"',
-            "pressure: tick: '0.1 lbf': the unit is not one of rad, deg",
-        ),
-        ('"-0.1 mN"', '"0 mN"', "pressure: the tick must not be 0"),
-        ('offset = "2 N"', 'offset = "2 V"', "pressure: offset and tick have different units, V and N"),
-        (
-            "address = 36, size = 4",
-            "address = 36, size = 2",
-            "yaw: the size must be 1, 2 or 4 (float32: 4), not 2",
-        ),
-        ("address = 36, ", "", "yaw: missing required field `address`"),
-        ("address = 36", "adress = 36, address = 36", "yaw: keys not allowed in an item of a device: adress"),
-        ("address = 36", 'address = "36"', "yaw: address: Expected `int`, got `str`"),
-        ("safe = 0", "safe = 8", "lamp: the safe value 8 is outside its range"),
-        ("initial = 0", "initial = 9", "lamp: the initial value 9 is outside its range"),
-        ("maximum = 7", "maximum = 256", "lamp: 0..256 does not fit into its bytes"),
-        ('access = "RW"', 'access = "R"', "lamp: a safe value needs a writable item in RAM"),
-        ('"force.z"', '"force z"', "pressure: 'force z' is not a state name (letters"),
-        ('"force.z"', '"age"', "pressure: the state name `age` is reserved"),
-        ("protocol = 2.0", "protocol = [2.0]", "protocol must be 1.0 or 2.0, not [2.0]"),
-        ('"-0.1 mN"', '"1/0 mN"', "pressure: tick: '1/0 mN' divides by 0"),
-        ('"2 N"', '"inf N"', "pressure: offset: 'inf N' is not a finite number"),
-        ('tick = "1 rad"', "maximum = 1", "yaw: a float32 cannot have minimum and maximum"),
-        ('tick = "1 rad"', "initial = 1", "yaw: initial and safe value of a float32 must be 0"),
-        ("{address = 0, size = 2", "{address = 4, size = 2", "a checked model number must be at address 0"),
-    ],
-)
-def test_a_mistake_is_named(before: str, after: str, sentence: str) -> None:
+@pytest.mark.parametrize("case", re.findall(r".+\n  .+", CASES))
+def test_a_mistake_is_named(case: str) -> None:
+    change, sentence = case.split("\n  ")
+    before, _, after = change.replace("\\n", "\n").partition(" => ")
     assert before in BOARD
-    with pytest.raises(ValueError) as error:  # noqa: PT011  # the sentence is what is compared
+    with pytest.raises(ValueError, match=re.escape(sentence)):
         read_device_table(BOARD.replace(before, after, 1))
-    assert sentence in str(error.value)
+
+
+NO_ALIAS = {'aliases = ["BOARD"]\n': ""}
 
 
 @pytest.mark.parametrize(
-    ("before", "after", "sentence"),
+    ("changes", "sentence"),
     [
-        ('"Board-1"', '"board"', "a name of board is already used by the device Board-1"),
-        ("60_001", "60_001 # Board-2", "model number 60001 of Board-2 is already used by the device Board-1"),
-        ('"Board-1"', '"AX12"', "AX12 is already the name of a servo model"),
-        ("60_001", "1020", "is already used by the servo XM430-W350"),
+        ({"Board-1": "board", "60_001": "60_002"}, "a name of board is already used by the device Board-1"),
+        ({"Board-1": "Board-2"} | NO_ALIAS, "number 60001 of Board-2 is already used by the device Board-1"),
+        ({"Board-1": "AX12", "60_001": "60_002"} | NO_ALIAS, "AX12 is already the name of a servo model"),
+        ({"Board-1": "Board-3", "60_001": "1020"} | NO_ALIAS, "is already used by the servo XM430-W350"),
     ],
 )
-def test_names_and_numbers_belong_to_one_model(before: str, after: str, sentence: str) -> None:
+def test_names_and_numbers_belong_to_one_model(changes: dict[str, str], sentence: str) -> None:
     add_device_table(BOARD)
-    other = BOARD.replace(before, after)
-    if "# Board-2" in other:
-        other = other.replace('"Board-1"', '"Board-2"')
-    if "# Board-2" not in other and "1020" not in other:
-        other = other.replace("60_001", "60_002")
-    if '"board"' not in other:
-        other = other.replace('aliases = ["BOARD"]\n', "")
-    if "1020" in other:
-        other = other.replace('"Board-1"', '"Board-3"')
-    with pytest.raises(ValueError, match="already") as error:
+    other = BOARD
+    for before, after in changes.items():
+        other = other.replace(before, after)
+    with pytest.raises(ValueError, match=sentence):
         add_device_table(other)
-    assert sentence in str(error.value)
     assert add_device_table(BOARD) is device_table("BOARD"), "a process may load its plug-ins twice"
 
 

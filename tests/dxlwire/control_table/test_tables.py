@@ -146,17 +146,14 @@ def test_degrees_a_tick(model: str, protocol: float, degrees: float, ticks: int)
     assert math.degrees(find_table(model, protocol).rad_per_tick) == pytest.approx(degrees / ticks, rel=1e-8)
 
 
+RPM = math.tau / 60
+
+
 @pytest.mark.parametrize(
     ("model", "protocol", "item", "tick", "si"),
     [
-        (
-            "MX-64",
-            1.0,
-            "moving_speed",
-            300,
-            34.2 * 2 * math.pi / 60,
-        ),  # "if it is set to 300, it is about 34.2 rpm"
-        ("MX-12W", 1.0, "moving_speed", 300, 274.8 * 2 * math.pi / 60),
+        ("MX-64", 1.0, "moving_speed", 300, 34.2 * RPM),  # "if it is set to 300, it is about 34.2 rpm"
+        ("MX-12W", 1.0, "moving_speed", 300, 274.8 * RPM),
         ("MX-28", 1.0, "goal_acceleration", 254, math.radians(2180)),
         ("MX-28", 1.0, "return_delay_time", 250, 500e-6),
         ("EX-106+", 1.0, "sensed_current", 100, 1.0),
@@ -166,9 +163,9 @@ def test_degrees_a_tick(model: str, protocol: float, degrees: float, ticks: int)
         ("XL430-W250", 2.0, "present_load", 1000, 1.0),
         ("XM430-W350", 2.0, "present_input_voltage", 120, 12.0),
         ("XM430-W350", 2.0, "bus_watchdog", 5, 0.1),
-        ("XM430-W350", 2.0, "profile_velocity", 100, 22.9 * 2 * math.pi / 60),
-        ("XM430-W350", 2.0, "profile_acceleration", 1, 214.577 * 2 * math.pi / 3600),
-        ("PH54-200-S500", 2.0, "velocity_limit", 2900, 29.0 * 2 * math.pi / 60),
+        ("XM430-W350", 2.0, "profile_velocity", 100, 22.9 * RPM),
+        ("XM430-W350", 2.0, "profile_acceleration", 1, 214.577 * RPM / 60),
+        ("PH54-200-S500", 2.0, "velocity_limit", 2900, 29.0 * RPM),
         ("YM070-210-M001", 2.0, "present_current", 100, 1.0),
     ],
 )
