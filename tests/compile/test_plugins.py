@@ -8,8 +8,8 @@ from typing import Annotated, ClassVar
 import numpy as np
 import pytest
 from pydantic import Field
+from tests.kit.packages import plugin_folder
 from tests.kit.robots import PAIR, compile_text, problems_in
-from tests.kit.stories import plugin_folder
 
 from dxlrun import CommandModel, Controller, Interfaces, ParametersModel
 from dxlrun.compile import robot_compiler

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from tests.kit.loops import PERIOD_NS
-from tests.kit.stories import plugin_folder
+from tests.kit.packages import plugin_folder
 
 from dxlrun.channels.answers import Code
 from dxlrun.channels.event_records import EventCode, Severity

@@ -20,7 +20,7 @@ from typing import Any
 
 import pytest
 from tests.kit.awaited import DEADLINE_S, until
-from tests.kit.stories import plugin_folder
+from tests.kit.packages import plugin_folder
 from tests.kit.wire import all_writes
 
 from dxlrun.channels.event_records import EventCode

@@ -107,13 +107,3 @@ def differing(path: Path, *settings: str) -> tuple[ReplayReport, ReplayDifferenc
     assert not report.same
     assert report.first is not None
     return report, report.first
-
-
-def plugin_folder(folder: Path, module: str, source: str, distribution: str) -> Path:
-    """Write a plug-in of one module into a folder, as pip would install it: version 1.0."""
-    (folder / f"{module}.py").write_text(source)
-    info = folder / f"{module}-1.0.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {distribution}\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text(f"[dxlrun]\n{module} = {module}\n")
-    return folder

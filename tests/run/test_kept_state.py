@@ -22,7 +22,7 @@ import pytest
 from msgspec.structs import replace
 from tests.kit.awaited import until
 from tests.kit.campaigns import campaign
-from tests.kit.stories import plugin_folder
+from tests.kit.packages import plugin_folder
 
 from dxlrun import ControllerFault
 from dxlrun.channels.cycle import CycleLayout, CycleRecord

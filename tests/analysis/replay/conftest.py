@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from tests.kit.anew import written_anew
-from tests.kit.stories import plugin_folder
+from tests.kit.packages import plugin_folder
 
 from dxlrun.testing import VirtualRobot, simulated_robot
 

@@ -19,7 +19,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from tests.kit.anew import flip, plan
 from tests.kit.campaigns import campaign
-from tests.kit.stories import Asked, ask, differing, plugin_folder, replayed, send, silence, switch, tell
+from tests.kit.packages import plugin_folder
+from tests.kit.stories import Asked, ask, differing, replayed, send, silence, switch, tell
 
 from dxlrun.channels.commands import CommandMessage
 from dxlrun.channels.event_records import EventCode
