@@ -14,7 +14,6 @@ import random
 import re
 import struct
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
@@ -25,6 +24,7 @@ from hypothesis import HealthCheck, Phase, seed, settings
 from hypothesis import given as given_
 from hypothesis import strategies as st
 from tests.kit.campaigns import campaign
+from tests.kit.wire import taken_apart, writes
 
 from dxlrun.compile.robot_compiler import compile_files
 from dxlrun.control.controllers.claims import ControllerSnapshot
@@ -107,11 +107,11 @@ def graphs(draw: st.DrawFn) -> Graph:
             one = One(name, joints, draw(st.sampled_from(SERVO_COMMANDS)))
         else:
             one = One(name, tuple(draw(st.lists(st.sampled_from(JOINTS), unique=True))))
-        lowest = [each.every for each in made if each.name in one.into]
-        if lowest:
-            every = np.lcm.reduce(lowest) * draw(st.sampled_from((1, 1, 2)))
+        below = [each for each in made if each.name in one.into]
+        if below:
+            every = np.lcm.reduce([each.every for each in below]) * draw(st.sampled_from((1, 1, 2)))
         reads = tuple(draw(st.lists(_readable(made), max_size=2)))
-        active = one.active and draw(st.integers(0, 5)) > 0 and not _inactive(one, made)
+        active = draw(st.integers(0, 5)) > 0 and all(each.active for each in below)
         made.append(replace(one, exports=exports, every=int(every), reads=reads, active=active))
     if draw(st.integers(0, 3)) == 0:
         joints = tuple(draw(st.lists(st.sampled_from(JOINTS), min_size=1, unique=True)))
@@ -121,10 +121,6 @@ def graphs(draw: st.DrawFn) -> Graph:
     for _ in range(draw(st.sampled_from((0, 0, 1, 1, 2)))):
         made = draw(_changed(made))
     return list(draw(st.permutations(made)))
-
-
-def _inactive(one: One, made: Graph) -> bool:
-    return any(not each.active for each in made if each.name in one.into)
 
 
 @st.composite
@@ -172,16 +168,7 @@ def _changed(draw: st.DrawFn, made: Graph) -> Graph:
     commands = interfaces if one.into else st.sampled_from(SERVO_COMMANDS)
     joints = st.lists(st.sampled_from(JOINTS), max_size=3, unique=True).map(tuple)
     reads = st.sampled_from(
-        [
-            "j1",
-            "j9/position",
-            "j1/pwm",
-            "a/position",
-            "z/j1/position",
-            "a/j1/position",
-            "b/j2/effort",
-            "a/b/c/d",
-        ]
+        "j1 j9/position j1/pwm a/position z/j1/position a/j1/position b/j2/effort a/b/c/d".split()  # noqa: SIM905
     )
     changes: list[dict[str, st.SearchStrategy[object]]] = [
         {"into": st.lists(st.sampled_from(names), max_size=3).map(tuple)},
@@ -334,16 +321,16 @@ def fallback_reasons(graph: Graph, one: One) -> set[str]:
         each.name for each in graph if each.active and one.name not in {each.name, *reach(graph, each.name)}
     }
     used = {low for name in staying for low in reach(graph, name)}
-    unused = {low for low in reach(graph, one.name) if not {low} & used and not _above(graph, low) & staying}
+    unused = {
+        low
+        for low in reach(graph, one.name) - used
+        if not any(low in reach(graph, each.name) for each in graph if each.name in staying)
+    }
     staying -= unused - entering
     for pair in clashes(graph, staying | entering):
         if pair & entering and pair - entering:
             return {"fallback claims"}
     return set()
-
-
-def _above(graph: Graph, name: str) -> set[str]:
-    return {one.name for one in graph if name in reach(graph, one.name)}
 
 
 SENTENCES = {
@@ -441,31 +428,15 @@ class Model:
         return self.commanded.get((ends[0].name, joint, interface), np.nan) if ends else np.nan
 
 
-def written(data: bytes) -> Iterator[tuple[int, int, bytes]]:
-    """Yield servo, address and bytes of each write to a servo in a stream of instruction packets."""
-    while (start := data.find(b"\xff\xff\xfd\x00")) >= 0:
-        servo, length = data[start + 4], struct.unpack_from("<H", data, start + 5)[0]
-        instruction, parameters = data[start + 7], data[start + 8 : start + 5 + length]
-        address = struct.unpack_from("<H", parameters)[0] if len(parameters) >= 2 else 0
-        if instruction == 0x83:  # sync write
-            (size,) = struct.unpack_from("<H", parameters, 2)
-            for at in range(4, len(parameters), size + 1):
-                yield parameters[at], address, parameters[at + 1 : at + 1 + size]
-        elif instruction == 0x03:
-            yield servo, address, parameters[2:]
-        data = data[start + 7 + length :]
-
-
 def goals_of(robot: VirtualRobot) -> dict[tuple[str, str], list[int]]:
     """Return the goals that each servo was sent, by joint and interface, from the ledger."""
     found: dict[tuple[str, str], list[int]] = {}
-    for entry in robot.ledger.entries:
-        if entry.direction == "in":
-            for servo, address, data in written(entry.data):
-                for interface, (first, form) in ADDRESSES.items():
-                    if address <= first and first + struct.calcsize(form) <= address + len(data):
-                        (value,) = struct.unpack_from(form, data, first - address)
-                        found.setdefault((f"j{servo}", interface), []).append(value)
+    for sent in taken_apart(robot.ledger.entries, 2.0):
+        for servo, address, data in writes(sent, 2.0):
+            for interface, (first, form) in ADDRESSES.items():
+                if address <= first and first + struct.calcsize(form) <= address + len(data):
+                    (value,) = struct.unpack_from(form, data, first - address)
+                    found.setdefault((f"j{servo}", interface), []).append(value)
     return found
 
 
@@ -551,7 +522,6 @@ def test_a_graph_runs_as_it_is_drawn_or_is_refused_for_its_reason(
         outcomes[f"accepted, {deepest} below"] += 1
 
     judge()
-    print("\n" + "\n".join(f"{count:6d} {what}" for what, count in sorted(outcomes.items())))
     assert outcomes["accepted"] > amount / 5
     assert outcomes["refused"] > amount / 10
     if amount >= 10_000:  # some are rare
