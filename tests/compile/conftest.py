@@ -16,12 +16,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
 
 
-UNITS = {
-    "position": 2 * np.pi / 4096,
-    "velocity": 0.229 * 2 * np.pi / 60,
-    "effort": 2.69e-3,
-    "pwm": 1 / 885,
-}
+UNITS = {"position": 2 * np.pi / 4096, "velocity": 0.229 * 2 * np.pi / 60, "effort": 2.69e-3, "pwm": 1 / 885}
 """One step of a goal on the wire, of an XM430."""
 READ: dict[str, list[np.ndarray]] = {}
 """What each part found in `reads`, update by update; the newest run's."""

@@ -97,12 +97,7 @@ motions:
             "robot.yaml:20:3: ",
             "controller mine (elsewhere 2.1) cannot name its interfaces: RuntimeError: not today",
         ),
-        (
-            "sleepy",
-            "",
-            "warning: ",
-            "the speeds of its motions cannot be checked: RuntimeError: not today",
-        ),
+        ("sleepy", "", "warning: ", "the speeds of its motions cannot be checked: RuntimeError: not today"),
         ("sad", "", "", "plug-in sad of sad-robots 0.3 cannot be imported; reinstall it"),
     ],
 )

@@ -48,10 +48,7 @@ def test_a_group_stands_for_its_joints_wherever_they_are_named() -> None:
     steps = [{"pose": {"left": 0, "knee": 1}, "torque": {"body": 2}}]
     assert without_groups({"steps": steps, "into": ["left"]}, description.groups) == {
         "steps": [
-            {
-                "pose": {"shoulder": 0, "elbow": 0, "knee": 1},
-                "torque": {"shoulder": 2, "elbow": 2, "knee": 2},
-            }
+            {"pose": {"shoulder": 0, "elbow": 0, "knee": 1}, "torque": {"shoulder": 2, "elbow": 2, "knee": 2}}
         ],
         "into": ["left"],  # a controller of that name
     }

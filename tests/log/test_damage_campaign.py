@@ -131,11 +131,7 @@ def test_a_log_that_is_cut_at_any_byte_is_read_up_to_its_last_whole_chunk(
 
 @campaign(ci=60, night=1000, release=10_000)
 def test_a_flipped_bit_costs_one_chunk_at_most(
-    written: Written,
-    tmp_path: Path,
-    most_memory: Callable[[], int],
-    amount: float,
-    chance: random.Random,
+    written: Written, tmp_path: Path, most_memory: Callable[[], int], amount: float, chance: random.Random
 ) -> None:
     refused = lost = 0
     count = int(amount)
@@ -180,11 +176,7 @@ def test_a_chunk_that_is_another_record_by_one_bit_is_missed(
 
 @campaign(ci=30, night=200, release=1000)
 def test_a_wrong_length_takes_no_memory_and_costs_what_it_covers(
-    written: Written,
-    tmp_path: Path,
-    most_memory: Callable[[], int],
-    amount: float,
-    chance: random.Random,
+    written: Written, tmp_path: Path, most_memory: Callable[[], int], amount: float, chance: random.Random
 ) -> None:
     for _ in range(int(amount)):
         size = chance.choice((4, 8))
