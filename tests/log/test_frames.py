@@ -1,4 +1,4 @@
-"""/tf and /tf_static: what other programs read of them, against pinocchio; rate, stamps, what is unknown."""
+"""/tf and /tf_static: what other programs read of them; rate, stamps, and what is unknown."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.kit.decoded import decode_log
 
 from dxlrun.channels.cycle import CycleRecord
 from dxlrun.channels.ring import RecordKind
-from dxlrun.description.frames.tree import ORIENTATION, FramesPlan
+from dxlrun.description.frames.tree import ORIENTATION, FramesPlan, FrameTree
 from dxlrun.log import schemas
 from dxlrun.log.log_reader import open_log
 from dxlrun.log.log_writer import LogWriter
@@ -90,35 +90,24 @@ class Scene:
         return STORE.deserialize_cdr(self.messages.still((5, 6)), schemas.FRAMES.name)
 
 
-# Against pinocchio, from the bytes that rosbags reads
+# The bytes that rosbags reads, against the tree, which tests/description/frames compares with pinocchio
 
 
 @campaign(ci=10, night=200, release=1000)
 @pytest.mark.parametrize("path", sorted(ROBOTS.rglob("*.urdf")), ids=lambda path: path.stem)
-def test_poses_of_logged_frames_are_those_of_pinocchio(
+def test_poses_of_logged_frames_are_those_of_the_tree(
     path: Path, amount: float, chance: random.Random
 ) -> None:
-    pin = pytest.importorskip("pinocchio", reason="pin has 380 MB, so only the extra `full` has it")
     urdf = read_urdf(path.read_text())
-    model = pin.buildModelFromXML(path.read_text(), mimic=True)
-    data = model.createData()
-    moving = [joint for joint in urdf.joints if joint.moves and joint.mimic is None]
-    scene = Scene(path.read_text(), tuple(joint.name for joint in moving))
+    moving = tuple(joint.name for joint in urdf.joints if joint.moves and joint.mimic is None)
+    scene, tree = Scene(path.read_text(), moving), FrameTree(urdf, moving)
     still = transforms(scene.still) if scene.messages.any_still else {}
+    assert urdf.links
     for _ in range(int(amount)):
-        positions = {joint.name: chance.uniform(-4, 4) for joint in moving}
-        q = pin.neutral(model)
-        for name, position in positions.items():
-            place = model.joints[model.getJointId(name)]
-            wheel = place.nq == 2
-            q[place.idx_q : place.idx_q + place.nq] = (
-                (math.cos(position), math.sin(position)) if wheel else position
-            )
-        pin.framesForwardKinematics(model, data, q)
+        positions = {name: chance.uniform(-4, 4) for name in moving}
         found = still | transforms(scene.at(positions))
-        assert urdf.links
         for link in urdf.links:
-            expected = data.oMf[model.getFrameId(link, pin.BODY)].homogeneous
+            expected = np.array(tree.pose(link, positions=positions).matrix)
             assert np.abs(in_root(link, found) - expected).max() < 1e-9, (link, positions)
 
 
