@@ -4,34 +4,31 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
+from tests.kit.commands import Dxlrun
 
 import dxlrun.cli
 from dxlrun.cli import run as run_room
 from dxlrun.cli import verb_registry
 from dxlrun.cli.inputs import examples_directory
+from dxlrun.plan.robot_plan import Plan
 from dxlrun.remote import sockets
 
-Dxlrun = Callable[..., Any]
 
-
-def test_demo_plays_its_motion_in_an_empty_directory(
-    dxlrun: Dxlrun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    ran = dxlrun("demo", "--virtual")
-    assert (ran.code, "bioloid_torso: done: ran for 35.0 s; 3 of 3 goals reached" in ran.out) == (0, True)
-    assert "warning" not in ran.err
-    assert len([*(tmp_path / "logs").glob("bioloid_torso_*.mcap")]) == 1
-
-
-def test_files_of_the_demo_are_among_the_examples_of_the_wheel() -> None:
-    """tests/test_suite.py builds the wheel and compares its examples with the folder of robots."""
-    assert all((examples_directory() / name).is_file() for name in run_room.DEMO)
+def test_demo_is_the_first_command_of_the_readme(dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch) -> None:
+    """tests/test_readme.py runs it; tests/test_suite.py builds the wheel and compares its examples."""
+    plans: list[tuple[Plan, dict[str, Any]]] = []
+    monkeypatch.setattr(run_room, "_run_plan", lambda plan, *_, **options: plans.append((plan, options)) or 0)
+    said = dxlrun("demo", "--virtual")
+    assert (said.code, said.err) == (0, "")
+    ((plan, options),) = plans
+    assert options["virtual"]
+    assert (plan.robot, plan.loop.end_ns) == ("bioloid_torso", 35_000_000_000)
+    assert {one.controller for one in plan.loop.commands} == {"head", "left_arm", "right_arm"}
+    files = [str(examples_directory() / name) for name in run_room.DEMO]
+    assert [name.rpartition("/")[2] for name in files] == ["bioloid_torso.yaml", "three_parts.yaml"]
 
 
 class Served:
@@ -73,7 +70,7 @@ def test_page_is_served_during_the_run_where_it_is_installed(
 
 
 def test_demo_without_the_page_names_the_package(
-    dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(run_room, "_run_plan", lambda *_, **__: 0)
     monkeypatch.setattr(verb_registry, "packaged", dict)
@@ -94,9 +91,8 @@ def test_page_is_that_of_the_robot_that_has_just_started(monkeypatch: pytest.Mon
 
 def test_process_of_the_page_runs_the_command_view(monkeypatch: pytest.MonkeyPatch) -> None:
     shown: list[list[str]] = []
-    monkeypatch.setattr(
-        run_room, "await_robot", lambda others: "bioloid_torso" if others == ["other"] else ""
-    )
+    robots = {("other",): "bioloid_torso"}
+    monkeypatch.setattr(run_room, "await_robot", lambda others: robots.get(tuple(others)))
     monkeypatch.setattr(dxlrun.cli, "main", shown.append)
     monkeypatch.setattr(sys, "argv", ["-c", "other"])
     with pytest.raises(SystemExit):
