@@ -17,24 +17,25 @@ import termios
 from collections.abc import Callable, Iterator
 from fcntl import ioctl
 from pathlib import Path
+from typing import Any
 
 import pytest
 from tests.kit.answers import read_answer, result_of
 from tests.kit.awaited import DEADLINE_S
-from tests.kit.pages import page_text
+from tests.kit.pages import page_blocks, page_text
 
 from dxlsim.bus.ledger import read_ledger
 
 pytestmark = pytest.mark.long
 
-CODE = "import sys; from dxlrun.cli import main; sys.exit(main(sys.argv[1:]))"
-OWN_TERMINAL = "import fcntl, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0)"
+PROGRAM = [sys.executable, "-P", "-m", "dxlrun"]
+OWN_TERMINAL = "import fcntl, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0); from dxlrun.cli import main; "
 """As a shell does it, so that Ctrl-C is a signal."""
-"""How long a test waits for what must come; it decides nothing but when to give up."""
 PING_1 = bytes.fromhex("ff ff fd 00 01 03 00 01 19 4e")
 PONG_1 = bytes.fromhex("ff ff fd 00 01 07 00 55 00 24 04 2d")
 """A ping of servo 1 (e-Manual, Protocol 2.0, Ping), and the first bytes of the answer of an XL430-W250."""
 PING_2 = bytes.fromhex("ff ff fd 00 02 03 00 01 19 72")
+OLD_PING, OLD_PONG = bytes.fromhex("ff ff 01 02 01 fb"), bytes.fromhex("ff ff 01 02 00 fc")
 TWO = """
 name: two_buses
 buses:
@@ -69,6 +70,9 @@ class Sim:
         line, _, self._said = self._said.partition(b"\n")
         return line.decode()
 
+    def result(self) -> Any:
+        return result_of(self.line())
+
     def type(self, line: str) -> None:
         self.input.write(line.encode() + b"\n")
         self.input.flush()
@@ -82,19 +86,24 @@ class Sim:
         self.process.send_signal(number)
         return self.end()
 
+    @property
+    def child(self) -> int:
+        """The process of the simulated bus."""
+        pid = self.process.pid
+        return int(Path(f"/proc/{pid}/task/{pid}/children").read_text().split()[0])
+
+
+Start = Callable[..., Sim]
+
 
 @pytest.fixture
-def start(tmp_path: Path) -> Iterator[Callable[..., Sim]]:
+def start(tmp_path: Path) -> Iterator[Start]:
+    pipe = subprocess.PIPE
     with contextlib.ExitStack() as stack:
 
         def start(*words: object) -> Sim:
-            process = subprocess.Popen(
-                [sys.executable, "-P", "-c", CODE, "sim", *map(str, words)],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.PIPE,
-                cwd=tmp_path,
-            )
+            command = [*PROGRAM, "sim", *map(str, words)]
+            process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, cwd=tmp_path)
             stack.enter_context(process)
             stack.callback(process.kill)
             return Sim(process)
@@ -116,22 +125,18 @@ def hear(path: Path | str, ask: bytes, size: int) -> bytes:
         os.close(port)
 
 
-def test_a_robot_runs_against_it_as_against_a_real_one(start, torso, tmp_path):
+def test_robot_runs_against_it_as_against_a_real_one(start: Start, torso: Path, tmp_path: Path) -> None:
     sim = start(torso, "--link", "torso", "--ledger", "ledger.jsonl")
     assert sim.line() == (
         "bioloid_torso: 8 servos simulated on 1 bus; Ctrl-C ends it, `help` lists faults to type"
     )
-    assert re.match(
-        r"  main: .*/torso \(/dev/pts/\d+\), 1000000 bit/s, Protocol 1.0, AX-12A 1-6, 20-21$", sim.line()
-    )
+    bus = r"  main: .*/torso \(/dev/pts/\d+\), 1000000 bit/s, Protocol 1.0, AX-12A 1-6, 20-21$"
+    assert re.match(bus, sim.line())
     assert sim.line().startswith("  in real time: ")
     hint = sim.line()
     assert hint == f"next: dxlrun {torso} port:={tmp_path / 'torso'}"
-
-    words = [*hint.split()[2:], "rate:=20", "--duration", "0.5", "--no-record"]
-    ran = subprocess.run(
-        [sys.executable, "-P", "-c", CODE, *words], capture_output=True, text=True, check=False, cwd=tmp_path
-    )
+    command = [*PROGRAM, *hint.split()[2:], "rate:=20", "--duration", "0.5", "--no-record"]
+    ran = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
     assert ran.returncode == 0, ran.stderr
     assert "bioloid_torso: " in ran.stdout
     code, out, err = sim.stop()
@@ -147,125 +152,98 @@ def test_a_robot_runs_against_it_as_against_a_real_one(start, torso, tmp_path):
     assert len(asked) > 100
 
 
-def test_servos_without_a_robot_file_answer_and_take_faults_that_are_typed(start):
-    sim = start("--servo", "XL430-W250:1-2", "--json")
-    ports = result_of(sim.line())["ports"]
-
-    assert hear(ports["main"], PING_1, 14)[:12] == PONG_1
+def test_servos_without_a_robot_file_answer_and_take_planned_and_typed_faults(
+    start: Start, tmp_path: Path
+) -> None:
+    planned = "overload servo=1 packet=2"
+    words = ("--fault", "lose servo=1", "--fault", planned, "--ledger", "ledger.jsonl")
+    sim = start("--servo", "XL430-W250:1-2", "--json", *words)
+    port = sim.result()["ports"]["main"]
+    assert hear(port, PING_1 + PING_1, 14)[:12] == PONG_1  # the first is lost
+    assert [sim.result(), sim.result()] == [{"fault": "lose servo=1"}, {"fault": planned}]
     sim.type("silence  servo=0x1")
-    assert result_of(sim.line()) == {"understood": "silence servo=1"}
-    assert result_of(sim.line()) == {"fault": "silence servo=1"}
-    sim.type("turn servo=2 by=30deg for=100ms")
-    assert result_of(sim.line()) == {"understood": "turn servo=2 by=30deg for=100ms"}
-    assert result_of(sim.line()) == {"fault": "turn servo=2 by=30deg for=100ms"}
+    assert sim.result() == {"understood": "silence servo=1"}
+    assert sim.result() == {"fault": "silence servo=1"}
     sim.type("slience servo=1")
     assert "did you mean silence?" in read_answer(sim.line()).errors[0].fix
     sim.type("help")
-    assert any(line.startswith("lose ") for line in result_of(sim.line())["faults"])
+    assert any(line.startswith("lose ") for line in sim.result()["faults"])
 
     sim.input.close()  # no more input: that ends nothing
     sim.process.stdin = None
-    assert hear(ports["main"], PING_2, 14)[:5] == PING_2[:5]
+    assert hear(port, PING_2, 14)[:5] == PING_2[:5]
     assert sim.stop(signal.SIGTERM) == (0, "", "")
+    notes = [entry.note for entry in read_ledger(tmp_path / "ledger.jsonl")]
+    faults = [note for note in notes if note.startswith("fault: ")]
+    assert faults == [f"fault: {one}" for one in ("lose servo=1", planned, "silence servo=1")]
 
 
-PAGE = page_text("simulation.md")
-
-
-def test_the_programs_of_the_page_run_against_the_servos_of_the_page(start, tmp_path):
+def test_programs_of_the_page_run_against_the_servos_of_the_page(start: Start, tmp_path: Path) -> None:
     link = str(tmp_path / "robot")
-    page = PAGE.replace("/tmp/robot", link)  # noqa: S108
-    (words,) = re.findall(r"^    dxlrun sim (--servo XL430.+)$", page, re.MULTILINE)
-    sim = start(*words.split(), "--json")
-    assert result_of(sim.line())["ports"] == {"main": link}
+    (words,) = re.findall(r"^    dxlrun sim (--servo XL430.+)$", page_text("simulation.md"), re.MULTILINE)
+    sim = start(*words.replace("/tmp/robot", link).split(), "--json")  # noqa: S108
+    assert sim.result()["ports"] == {"main": link}
+    path = {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
     said = [
-        subprocess.run(
-            [sys.executable, "-c", code],
-            capture_output=True,
+        subprocess.check_output(
+            [sys.executable, "-c", code.replace("/tmp/robot", link)],  # noqa: S108
             text=True,
-            check=True,
             cwd=tmp_path,
-            env=os.environ | {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"},
-        ).stdout
-        for code in re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+            env=os.environ | path,
+        )
+        for code in page_blocks("simulation.md", "python")
     ]
-
     assert said[0] == "(1060, 0, 0)\n"
     assert len(json.loads(said[1])) == 3
     assert result_of(said[2]) == {"fault": "silence servo=2"}
     assert sim.stop()[0] == 0
 
 
-def test_every_bus_is_simulated_and_has_a_link_that_follows_its_adapter(start, tmp_path):
+def test_every_bus_is_simulated_and_has_a_link_that_follows_its_adapter(start: Start, tmp_path: Path) -> None:
     (tmp_path / "robot.yaml").write_text(TWO)
     sim = start("robot.yaml", "--link", "robot", "--json")
-    printed = result_of(sim.line())
-
-    assert printed["ports"] == {name: str(tmp_path / f"robot.{name}") for name in ("left", "right")}
-    assert {name: os.readlink(port) for name, port in printed["ports"].items()} == printed["devices"]
-    assert hear(printed["ports"]["left"], PING_1, 14)[:12] == PONG_1
-    sim.type("unplug bus=left for=200ms")
+    printed = sim.result()
+    ports = printed["ports"]
+    assert ports == {name: str(tmp_path / f"robot.{name}") for name in ("left", "right")}
+    assert {name: os.readlink(port) for name, port in ports.items()} == printed["devices"]
+    assert hear(ports["left"], PING_1, 14)[:12] == PONG_1
     line = "unplug bus=left for=200ms"
+    sim.type(line)
     for expected in ({"understood": line}, {"fault": line}, {"devices": {"left": ""}}):
-        assert result_of(sim.line()) == expected
-    (back,) = result_of(sim.line())["devices"].values()
+        assert sim.result() == expected
+    (back,) = sim.result()["devices"].values()
     assert back != printed["devices"]["left"]
-    assert os.readlink(printed["ports"]["left"]) == back
-    assert hear(printed["ports"]["left"], PING_1, 14)[:12] == PONG_1
-    assert hear(printed["ports"]["right"], bytes.fromhex("ff ff 01 02 01 fb"), 6) == bytes.fromhex(
-        "ff ff 01 02 00 fc"
-    )
+    assert os.readlink(ports["left"]) == back
+    assert hear(ports["left"], PING_1, 14)[:12] == PONG_1
+    assert hear(ports["right"], OLD_PING, 6) == OLD_PONG
     assert sim.stop()[0] == 0
     assert not list(tmp_path.glob("robot.*t"))
 
 
-def test_a_planned_fault_is_printed_when_it_happens_and_is_in_the_ledger(start, tmp_path):
-    sim = start("--servo", "XL430-W250:1", "--fault", "lose servo=1", "--fault", "overload servo=1 packet=2",
-                "--ledger", "ledger.jsonl")  # fmt: skip
-    sim.line()
-    port = sim.line().split()[1].rstrip(",")
-    sim.line()
-    hear(port, PING_1 + PING_1, 14)
-
-    assert [sim.line(), sim.line()] == ["fault: lose servo=1", "fault: overload servo=1 packet=2"]
-    assert sim.stop()[0] == 0
-    notes = [entry.note for entry in read_ledger(tmp_path / "ledger.jsonl")]
-    assert [note for note in notes if note.startswith("fault: ")] == [
-        "fault: lose servo=1",
-        "fault: overload servo=1 packet=2",
-    ]
-
-
-def test_a_simulation_whose_process_dies_fails_with_a_sentence(start, tmp_path):
+def test_simulation_whose_process_dies_fails_with_a_sentence(start: Start) -> None:
     sim = start("--servo", "AX-12A:1", "--json", "--link", "robot")
     sim.line()
-    children = Path(f"/proc/{sim.process.pid}/task/{sim.process.pid}/children").read_text().split()
-    os.kill(int(children[0]), signal.SIGKILL)
+    os.kill(sim.child, signal.SIGKILL)
     code, _, err = sim.end()
-
     assert code == 1
     assert "simulation: the simulated bus exited unexpectedly" in err
 
 
-def test_a_ledger_that_is_not_complete_fails_at_the_end(start):
+def test_ledger_that_is_not_complete_fails_at_the_end(start: Start) -> None:
     sim = start("--servo", "AX-12A:1", "--json", "--ledger", "ledger.jsonl")
-    port = result_of(sim.line())["ports"]["main"]
-    (child,) = Path(f"/proc/{sim.process.pid}/task/{sim.process.pid}/children").read_text().split()
-    resource.prlimit(int(child), resource.RLIMIT_FSIZE, (100, 100))  # as a full disk; the sentence has room
-    assert hear(port, bytes.fromhex("ff ff 01 02 01 fb"), 6) == bytes.fromhex("ff ff 01 02 00 fc")
+    port = sim.result()["ports"]["main"]
+    resource.prlimit(sim.child, resource.RLIMIT_FSIZE, (100, 100))  # as a full disk; the sentence has room
+    assert hear(port, OLD_PING, 6) == OLD_PONG
     code, _, err = sim.stop()
-
     assert code == 1
     assert err.startswith("simulation: the ledger is not complete: ")
 
 
-def test_a_front_that_is_killed_leaves_no_link(start, tmp_path):
+def test_front_that_is_killed_leaves_no_link(start: Start, tmp_path: Path) -> None:
     sim = start("--servo", "AX-12A:1", "--json", "--link", "robot")
     sim.line()
-    (child,) = Path(f"/proc/{sim.process.pid}/task/{sim.process.pid}/children").read_text().split()
-    ended = os.pidfd_open(int(child))
+    ended = os.pidfd_open(sim.child)
     sim.process.kill()
-
     assert select.select([ended], [], [], DEADLINE_S)[0]
     os.close(ended)
     assert not os.path.lexists(tmp_path / "robot")
@@ -277,7 +255,7 @@ def on_terminal(tmp_path: Path, *words: str) -> Iterator[tuple[subprocess.Popen[
     ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 120, 0, 0))
     environment = {name: value for name, value in os.environ.items() if name not in ("COLUMNS", "LINES")}
     process = subprocess.Popen(
-        [sys.executable, "-P", "-c", f"{OWN_TERMINAL}; {CODE}", "sim", *words],
+        [sys.executable, "-P", "-c", f"{OWN_TERMINAL}raise SystemExit(main())", "sim", *words],
         stdin=theirs,
         stdout=theirs,
         stderr=theirs,
@@ -294,7 +272,7 @@ def on_terminal(tmp_path: Path, *words: str) -> Iterator[tuple[subprocess.Popen[
         os.close(ours)
 
 
-def test_on_a_terminal_a_table_lives_and_letters_are_shown(tmp_path):
+def test_on_a_terminal_a_table_lives_and_letters_are_shown(tmp_path: Path) -> None:
     with on_terminal(tmp_path, "--servo", "XL430-W250:1-2") as (process, terminal):
         shown = ""
 
@@ -310,8 +288,7 @@ def test_on_a_terminal_a_table_lives_and_letters_are_shown(tmp_path):
         termios.tcsetattr(terminal, termios.TCSANOW, mode)
         process.send_signal(signal.SIGCONT)
         while termios.tcgetattr(terminal)[3] & termios.ECHO:
-            drawn = len(shown)
-            until(rf"(?s).{{{drawn}}}.*asked")
+            until(rf"(?s).{{{len(shown)}}}.*asked")
         os.write(terminal, b"overlaod\x7f\x7f\x7foad servo=2")
         until("fault> overload servo=2")
         os.write(terminal, b"\n")

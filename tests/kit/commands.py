@@ -14,6 +14,8 @@ values of its answer with --json, and then all lines of the errors, without `dxl
 words; spaces are not counted, and a blank line ends a case. `robots` is in the working directory,
 whose path is cut from what is printed. A refused command writes nothing, and says the same with --json.
 
+A text that begins with `# Each command is a case` has no blank lines between them.
+
 A stage adds lines of its own to a text: what is given before a command, and what is asked after it.
 """
 
@@ -79,22 +81,23 @@ def cases(name: str) -> list[Any]:
 
 
 def _cases(name: str) -> Iterator[Any]:
-    head, rule, _ = (TEXTS / name).read_text("utf-8").rpartition("====\n")
+    text = (TEXTS / name).read_text("utf-8")
+    head, rule, _ = text.rpartition("====\n")
     parts = re.split(r"^---- (.+)\n", head, flags=re.MULTILINE)
     files = dict(zip(parts[1::2], parts[2::2], strict=True))
     first = (head + rule).count("\n")
+    each = text.startswith("# Each command is a case")
     block: list[tuple[int, str]] = []
-    for number, line in enumerate([*(TEXTS / name).read_text("utf-8").splitlines(), ""], 1):
+    for number, line in enumerate([*text.splitlines(), ""], 1):
         if line.startswith("#") or number <= first:
             continue
+        if block and (not line or (each and not line.startswith(" "))):
+            command = block[0][1]
+            marks = [pytest.mark.needs(extra) for start, extra in NEEDED.items() if command.startswith(start)]
+            yield pytest.param(Case(name, files, block), id=command, marks=marks)
+            block = []
         if line:
             block.append((number, line))
-        elif block:
-            marks = [
-                pytest.mark.needs(extra) for start, extra in NEEDED.items() if block[0][1].startswith(start)
-            ]
-            yield pytest.param(Case(name, files, block), id=block[0][1], marks=marks)
-            block = []
 
 
 class Stage:

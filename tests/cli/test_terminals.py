@@ -1,0 +1,111 @@
+"""Narrow terminals, closed streams, full disks behind them, readers that leave: all of it in processes."""
+
+from __future__ import annotations
+
+import os
+import pty
+import re
+import struct
+import subprocess
+import sys
+import termios
+from fcntl import ioctl
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.long
+
+PROGRAM = [sys.executable, "-P", "-m", "dxlrun"]
+ALL = ">&- 2>&- <&-"
+
+
+def on_terminal(columns: int, *words: str, terminal: str = "xterm") -> str:
+    """Return what a terminal of that width gets to show."""
+    ours, theirs = pty.openpty()
+    ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, columns, 0, 0))
+    environment = {name: value for name, value in os.environ.items() if name not in ("COLUMNS", "LINES")}
+    environment |= {"TERM": terminal, "NO_COLOR": "1"}
+    command = [*PROGRAM, *words]
+    process = subprocess.Popen(command, stdin=theirs, stdout=theirs, stderr=theirs, env=environment)
+    os.close(theirs)
+    shown = b""
+    while True:
+        try:
+            shown += os.read(ours, 65536)
+        except OSError:  # how Linux reports that the terminal has no writer any more
+            break
+    os.close(ours)
+    assert process.wait() == 0
+    return re.sub(r"\x1b\[[0-9;]*m", "", shown.decode())
+
+
+@pytest.mark.parametrize("columns", [20, 40, 160])
+def test_no_fact_is_lost_on_a_narrow_terminal(torso: Path, columns: int) -> None:
+    shown = on_terminal(columns, "check", str(torso))
+    words = set("".join(character if character.isprintable() else " " for character in shown).split())
+    together = "".join(shown.split())
+    assert "…" not in shown
+    for fact in ("left_shoulder_lateral_joint", "joint_trajectory_controller", "-101.41..+101.41", "20"):
+        assert fact in together
+    assert {"main", "AX-12A"} <= {word.strip(",:") for word in words}
+    joints = shown.split("Joints (deg)")[1].split("Controllers")[0]
+    longest = max(len(line.rstrip()) for line in joints.splitlines())
+    assert longest <= max(columns, len("  right_shoulder_lateral_joint,"))  # a name is never broken
+    assert ("─────" in shown) >= (columns == 160)
+
+
+@pytest.mark.parametrize("terminal", ["xterm", "dumb"])
+def test_no_head_is_cut_on_80_columns(torso: Path, terminal: str) -> None:
+    for words in (("models", "--protocol", "1.0"), ("models", "AX-12A")):
+        shown = on_terminal(80, *words, terminal=terminal)
+        assert "…" not in shown
+        assert "300 deg" in shown
+        assert max(map(len, shown.splitlines())) <= 81  # soft wraps end behind the last column
+    shown = on_terminal(80, "check", str(torso), terminal=terminal).split("Time of one cycle")[1]
+    assert "─────" in shown
+    assert "…" not in shown
+
+
+def shell(line: str, directory: Path, **words: object) -> subprocess.CompletedProcess[str]:
+    program = " ".join(PROGRAM)
+    line = f'dxlrun() {{ {program} "$@"; }}; {line.format(**words)}'
+    command = ["/bin/bash", "-c", line]
+    return subprocess.run(command, cwd=directory, capture_output=True, text=True, check=False)
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "closed"),
+    [
+        *(("check missing.yaml", 2, closed) for closed in (">&-", ">&- <&-", ALL, "2>&-", "2> /dev/full")),
+        ("check {torso}", 0, ALL),
+        ("{torso} --virtual --duration 0.2 --no-record", 0, ALL),  # in real time: tests/run/test_exits.py
+    ],
+)
+def test_closed_streams_change_nothing_but_what_is_seen(
+    tmp_path: Path, torso: Path, words: str, code: int, closed: str
+) -> None:
+    said = shell(f"dxlrun {words} {closed}", tmp_path, torso=torso)
+    assert said.returncode == code, said.stdout + said.stderr
+    assert "Traceback" not in said.stderr
+    assert said.stdout == "" or closed == "2>&-"
+
+
+def test_full_disk_behind_the_output_is_one_sentence(tmp_path: Path, torso: Path) -> None:
+    said = shell("dxlrun check {torso} > /dev/full", tmp_path, torso=torso)
+    assert said.returncode == 1
+    assert said.stderr.splitlines()[-1] == "dxlrun: No space left on device; run with --debug for details"
+
+
+@pytest.mark.parametrize("words", ["check {torso}", "check {torso} --json", "--help", "check missing.yaml"])
+def test_reader_that_leaves_early_gets_no_traceback(tmp_path: Path, torso: Path, words: str) -> None:
+    said = shell(f"dxlrun {words} 2>&1 | head -n 1", tmp_path, torso=torso)
+    assert said.stderr == ""
+    assert "Traceback" not in said.stdout
+
+
+def test_terminal_that_knows_ascii_alone_gets_tables_and_graphs_in_it(tmp_path: Path, torso: Path) -> None:
+    line = "export PYTHONIOENCODING=ascii; dxlrun check {torso} --graph && dxlrun check {torso}"
+    said = shell(line, tmp_path, torso=torso)
+    assert (said.returncode, said.stdout.isascii()) == (0, True), said.stderr
+    assert "\n" + "-" * 80 in said.stdout
