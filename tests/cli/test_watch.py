@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Callable
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import pytest
@@ -22,6 +23,9 @@ from dxlrun.remote.named.named_joints import states_of
 from dxlwire.joint_unit import ROTARY
 from dxlwire.modes import Mode
 
+NAMES = ("arm_pid", "arm", "spare")
+UNITS = {"foot/force.x": "N", "imu/voltage": "V"}
+
 
 class Robot:
     """A robot with so many joints, which ends after some looks."""
@@ -29,23 +33,19 @@ class Robot:
     name = "humanoid"
 
     def __init__(self, joints: int = 20, looks: int = 1000, sources: bool = False) -> None:
-        self.sources = sources
+        self.sources, self.looks, self.asked = sources, looks, 0
         self.names = [f"left_shoulder_joint_{number}" for number in range(joints)]
-        self.looks = looks
-        self.asked = 0
 
     def __enter__(self) -> Robot:
         return self
 
-    def __exit__(self, *_: object) -> None:
-        pass
+    def __exit__(self, *_: object) -> None: ...
 
     def info(self) -> dict[str, Any]:
         one = {"held": False, "rate": 50.0, "joints": self.names, "command": ["position"]}
         controllers = [
-            {"name": "arm_pid", "active": True, "into": [], **one},
-            {"name": "arm", "active": True, "into": ["arm_pid"], **one},
-            {"name": "spare", "active": False, "into": [], **one},
+            {"name": name, "active": name != "spare", "into": ["arm_pid"] * (name == "arm"), **one}
+            for name in NAMES
         ]
         known = {"rate": 50.0, "paused": False, "cycles": 7, "skipped": 2, "joints": self.names}
         return {**known, "controllers": controllers}
@@ -56,7 +56,7 @@ class Robot:
             raise DxlrunError(f"{self.name} no longer answers: gone")
         rows = len(self.names)
         sources = {"foot": ("force.x", "force.y"), "imu": ("voltage",)} if self.sources else {}
-        layout = CycleLayout(self.names, ("arm_pid", "arm", "spare"), (), sources)
+        layout = CycleLayout(self.names, NAMES, (), sources)
         record = CycleRecord(layout)
         states, goals = record.states, record.goals
         woken_ns = (100 + self.asked) * 1_000_000_000
@@ -73,28 +73,23 @@ class Robot:
             record.sources.values[:] = 12.5, np.nan, 11.9
             record.sources.valid[:], record.sources.age_ns[:] = (False, True), (1_250_000_000, 2_000_000)
         record.controller_ns[1] = 25_000
-        plan: Any = SimpleNamespace(
-            loop=SimpleNamespace(
-                joints=[SimpleNamespace(unit=ROTARY)] * rows,
-                source_units={"foot/force.x": "N", "imu/voltage": "V"},
-                command_units={},
-            ),
-            servos_by_joint={},
-        )
+        joints = [SimpleNamespace(unit=ROTARY)] * rows
+        loop = SimpleNamespace(joints=joints, source_units=UNITS, command_units={})
+        plan: Any = SimpleNamespace(loop=loop, servos_by_joint={})
         found = states_of(plan, record, {name: place for place, name in enumerate(layout.controllers)})
         return replace(found, effort_units=("A",) * rows)
 
     def events(self, after: int) -> dict[str, Any]:
         one = {"name": "gate", "source": "arm", "text": "something\nhappened " + "x" * 200}
-        number = after + 1
-        return {
-            "events": [{"number": number, "time": 100.0, "severity": 40, "origin": "", **one}],
-            "last": number,
-        }
+        event = {"number": after + 1, "time": 100.0, "severity": 40, "origin": "", **one}
+        return {"events": [event], "last": after + 1}
+
+
+Shown = Callable[..., tuple[int, str]]
 
 
 @pytest.fixture
-def shown(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Any:
+def shown(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Shown:
     """Run `watch` on a robot; return its exit code and what it printed."""
 
     def run(
@@ -114,12 +109,13 @@ def frame(width: int, height: int, joints: int = 20, looks: int = 3, sources: bo
     watched = watch.WatchedRobot(Robot(joints, sources=sources))  # type: ignore[arg-type]  # a stand-in
     for _ in range(looks):
         watched.poll_robot()
-    console = Console(file=io.StringIO(), width=width, height=height, force_terminal=False)
+    file = io.StringIO()
+    console = Console(file=file, width=width, height=height, force_terminal=False)
     console.print(watch.view(watched, width, height))
-    return console.file.getvalue().splitlines()  # type: ignore[attr-defined]  # it is a StringIO
+    return file.getvalue().splitlines()
 
 
-def test_devices_and_sensors_are_shown_with_their_age(shown: Any) -> None:
+def test_devices_and_sensors_are_shown_with_their_age(shown: Shown) -> None:
     code, printed = shown(Robot(sources=True), once=True)
     assert code == 0
     lines = [" ".join(line.split()) for line in printed.splitlines()]
@@ -150,58 +146,47 @@ def test_no_size_breaks_it(width: int, height: int) -> None:
     assert len(lines) <= max(height, 8)
 
 
-def test_a_large_terminal_has_controllers_and_events() -> None:
+def test_large_terminal_has_controllers_and_events() -> None:
     text = "\n".join(frame(120, 50))
     assert "arm_pid" in text
     assert "25 us" in text
     assert text.count("something happened") == 3
 
 
-def test_a_pipe_gets_one_snapshot(shown: Any) -> None:
+def test_pipe_gets_one_snapshot(shown: Shown) -> None:
     robot = Robot(6)
     code, said = shown(robot)
     assert (code, robot.asked) == (0, 1)
     assert "humanoid: 50 Hz, cycle 50" in said
-    for text in (
-        "34.4",
-        "28.6",
-        "0.12 A",
-        "57.3/s",
-        "limp error 0x20",
-        "lost",
-        "on silent",
-        "arm_pid",
-        "spare",
-    ):
-        assert text in said, text
+    texts = ("34.4", "28.6", "0.12 A", "57.3/s", "limp error 0x20", "lost", "on silent", "arm_pid", "spare")
+    assert [text for text in texts if text not in said] == []
     assert "-0.0" not in said
     assert "\x1b" not in said
 
 
-def test_json_is_one_object_a_line_until_the_run_ends(shown: Any) -> None:
+def test_json_is_one_object_a_line_until_the_run_ends(shown: Shown) -> None:
     code, said = shown(Robot(6, looks=4), as_json=True)
     lines = [result_of(line) for line in said.splitlines()]
-    assert (code, len(lines)) == (0, 4)
-    assert [line["cycle"] for line in lines] == [50, 100, 150, 200]
-    assert [len(line["events"]) for line in lines] == [1] * 4
+    assert code == 0
+    assert [(line["cycle"], len(line["events"])) for line in lines] == [(50, 1), (100, 1), (150, 1), (200, 1)]
     assert lines[2]["measured_rate"] == pytest.approx(50.0)
     assert shown(Robot(6), as_json=True, once=True)[1].count("\n") == 1
 
 
-def test_a_robot_that_is_there_and_does_not_answer_is_an_error(shown: Any) -> None:
+def test_ctrl_c_ends_it_and_a_robot_that_does_not_answer_is_an_error(
+    shown: Shown, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with pytest.raises(DxlrunError, match="no longer answers"):
         shown(Robot(6, looks=2), runs=True, as_json=True)
 
-
-def test_an_interrupt_is_its_end(shown: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupt(_: float) -> None:
+    def interrupt(_: float) -> NoReturn:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(watch.time, "sleep", interrupt)
     assert shown(Robot(6), as_json=True)[0] == 0
 
 
-def test_the_newest_event_stands_last() -> None:
+def test_newest_event_is_the_last() -> None:
     watched = watch.WatchedRobot(Robot())  # type: ignore[arg-type]  # a stand-in
     watched.poll_robot()
     event = {"severity": 20, "source": "loop", "name": "steered"}
