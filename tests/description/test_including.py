@@ -1,3 +1,6 @@
+# ruff: noqa: E501 (a mistake and its sentence are read best side by side)
+"""Fragments of robot files: what they add, which file wins, and where mistakes are."""
+
 from __future__ import annotations
 
 import functools
@@ -35,7 +38,6 @@ def including() -> str:
 
 def test_a_fragment_adds_its_keys_before_those_of_the_file(including: str) -> None:
     robot = desk.robot(including).robot
-
     assert list(robot.joints) == ["yaw", "swing", "elbow"]
     assert list(robot.controllers) == ["head", "broadcaster", "arm"]
     assert robot.joints["yaw"].limits.velocity == 1.0
@@ -43,66 +45,54 @@ def test_a_fragment_adds_its_keys_before_those_of_the_file(including: str) -> No
 
 def test_arguments_of_fragments_are_arguments_of_the_robot(including: str) -> None:
     description = desk.robot(including, {"speed": "2 rad/s"})
-
     assert description.robot.joints["yaw"].limits.velocity == 2.0
     assert description.arguments == {"speed": "2 rad/s", "port": "sim", "rate": "50"}
     assert description.robot.buses["main"].port == "sim"  # the including file's default counts
 
 
-def test_the_including_file_wins_at_every_depth(including: str) -> None:
+def test_the_including_file_wins_at_every_depth_but_replaces_lists(including: str) -> None:
     text = including.replace("joints:\n", "joints:\n  yaw: {id: 7, limits: {position: [-1 rad, 1 rad]}}\n", 1)
-    joint = desk.robot(text).robot.joints["yaw"]
-
+    text = text.replace("controllers:\n", "controllers:\n  head: {joints: [swing]}\n")
+    description = desk.robot(text)
+    joint, marks = description.robot.joints["yaw"], description.marks
     assert (joint.id, joint.bus, joint.model) == (7, "main", "AX-12A")
     assert (joint.limits.position, joint.limits.velocity) == ((-1.0, 1.0), 1.0)
+    assert description.robot.controllers["head"].parameters == {"joints": ["swing"]}
 
-
-def test_a_list_is_replaced_not_merged(including: str) -> None:
-    text = including.replace("controllers:\n", "controllers:\n  head: {joints: [swing]}\n")
-
-    assert desk.robot(text).robot.controllers["head"].parameters == {"joints": ["swing"]}
-
-
-def test_each_mark_points_into_the_file_that_has_the_value(including: str) -> None:
-    text = including.replace("joints:\n", "joints:\n  yaw: {id: 7}\n", 1)
-    marks = desk.robot(text).marks
     main, fragment = str(Path.cwd() / "robot.yaml"), str(Path.cwd() / "fragments/head.yaml")
-
     assert marks.value("joints", "yaw", "id") == Mark(main, 12, 13)
     assert marks.value("joints", "yaw", "model") == Mark(fragment, 5, 35)
-    assert marks.key("controllers", "head") == Mark(fragment, 7, 3)
     assert marks.origins["joints", "yaw", "limits", "velocity"] == "speed:=1 rad/s"
+    assert marks.value("controllers", "head", "joints", 0) == Mark(
+        main, 16, 19
+    )  # that of the fragment is gone
 
 
-def test_marks_of_what_was_replaced_are_gone(including: str) -> None:
-    text = including.replace("controllers:\n", "controllers:\n  head: {joints: 5}\n")
-    marks = desk.robot(text).marks
-
-    assert marks.value("controllers", "head", "joints", 0) == marks.key("controllers", "head", "joints")
+WRONG_ID = "joints.yaw.id is the text 'x', but must be a whole number; write for example `id: 1`"
 
 
-def test_mistakes_are_said_where_they_stand_and_all_at_once(including: str) -> None:
-    desk.write(HEAD.replace("id: 21", "id: x").replace("${speed}", "${sped}"), "fragments/head.yaml")
-
-    assert desk.refusals(including.replace("direction: 1}", "direction: 2}")) == [
-        "fragments/head.yaml:5:24: joints.yaw.id is the text 'x', but must be a whole number; "
-        "write for example `id: 1`",
-        "fragments/head.yaml:5:95: argument 'sped' is not declared; did you mean speed?",
-        "robot.yaml:13:75: joints.elbow.direction is 2, but must be 1 or -1; write one of them",
-    ]
+@pytest.mark.parametrize(
+    ("right", "wrong", "said"),
+    [
+        ("id: 21", "id: x", [f"fragments/head.yaml:5:24: {WRONG_ID}"]),
+        ("${speed}", "${sped}", ["fragments/head.yaml:5:96: argument 'sped' is not declared; did you mean speed?"]),
+        ("bus: main, ", "", ["fragments/head.yaml:5:3: joints.yaw has no bus; add `bus: main`"]),
+        ("controllers:", "controllers: {}\ncontrollers:", ["fragments/head.yaml:7:1: controllers is already defined in line 6; keep one of the two"]),
+    ],
+)  # fmt: skip
+def test_mistakes_of_a_fragment_are_reported_where_they_are(
+    including: str, right: str, wrong: str, said: list[str]
+) -> None:
+    desk.write(HEAD.replace(right, wrong), "fragments/head.yaml")
+    own = "robot.yaml:13:75: joints.elbow.direction is 2, but must be 1 or -1; write one of them"
+    assert desk.refusals(including) == said
+    assert desk.refusals(including.replace("direction: 1}", "direction: 2}")) == [*said, own]
 
 
 def test_what_the_fragment_got_wrong_and_the_file_replaced_is_no_mistake_of_form(including: str) -> None:
     desk.write(HEAD.replace("id: 21", "id: x"), "fragments/head.yaml")
-
     robot = desk.robot(including.replace("joints:\n", "joints:\n  yaw: {id: 7}\n", 1)).robot
     assert robot.joints["yaw"].id == 7
-
-
-def test_a_key_that_no_file_has_is_missing_where_the_mapping_stands(including: str) -> None:
-    desk.write(HEAD.replace("bus: main, ", ""), "fragments/head.yaml")
-
-    assert desk.refusals(including) == ["fragments/head.yaml:5:3: joints.yaw has no bus; add `bus: main`"]
 
 
 def test_fragments_include_relative_to_themselves_and_later_ones_win() -> None:
@@ -132,18 +122,16 @@ def test_a_fragment_that_two_files_include_counts_below_both() -> None:
     assert desk.robot(text).robot.recording.directory == "left"
 
 
-def test_a_cycle_is_refused_with_its_way() -> None:
+@pytest.mark.parametrize(
+    ("first", "place", "way"),
+    [("a.yaml", "b.yaml:1:11: ./a.yaml", "a.yaml -> b.yaml -> a.yaml"), ("robot.yaml", "robot.yaml:1:11: robot.yaml", "robot.yaml -> robot.yaml")],
+)  # fmt: skip
+def test_a_circle_is_refused_with_its_way(first: str, place: str, way: str) -> None:
     desk.write("include: [b.yaml]\n", "a.yaml")
     desk.write("include: [./a.yaml]\n", "b.yaml")
-
-    assert desk.refusals(f"include: [a.yaml]\n{TORSO}") == [
-        "b.yaml:1:11: ./a.yaml includes itself (a.yaml -> b.yaml -> a.yaml); remove one of these includes"
+    assert desk.refusals(f"include: [{first}]\n{TORSO}") == [
+        f"{place} includes itself ({way}); remove one of these includes"
     ]
-
-
-def test_a_file_that_includes_itself_is_refused() -> None:
-    (problem,) = desk.refusals(f"include: [robot.yaml]\n{TORSO}")
-    assert problem.startswith("robot.yaml:1:11: robot.yaml includes itself")
 
 
 def test_depth_number_and_size_are_bounded() -> None:
@@ -177,14 +165,6 @@ def test_fragments_that_cannot_be_read_are_named_at_the_include() -> None:
         "check the name; it is relative to the folder of this file",
         "broken.yaml:1:4: this [ is not closed; write ] at the end",
         "robot.yaml:1:35: folder.yaml: this is a directory; name a YAML file",
-    ]
-
-
-def test_a_key_given_twice_inside_one_file_is_still_a_mistake(including: str) -> None:
-    desk.write(HEAD + "controllers: {}\n", "fragments/head.yaml")
-
-    assert desk.refusals(including) == [
-        "fragments/head.yaml:8:1: controllers is already defined in line 6; keep one of the two"
     ]
 
 
