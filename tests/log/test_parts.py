@@ -1,9 +1,10 @@
-"""A log in parts, split by size or time, all kept or the newest; read as one, or one by one."""
+"""A log in parts, split by size or time, all kept or the newest; read as a whole, and while it is written."""
 
 from __future__ import annotations
 
 import errno
 import os
+import random
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -19,6 +20,7 @@ from dxlrun.channels.ring import Handover, RecordKind
 from dxlrun.errors import LogError
 from dxlrun.log.log_file import LogFile
 from dxlrun.log.log_reader import Log, LogFollower, open_log, read_log
+from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.part_writer import PartWriter, open_writer
 from dxlrun.log.schemas import LogHeader
 from dxlrun.plan.recording_plan import PART_END_NAME, PART_NAME, RecordingPlan
@@ -349,3 +351,53 @@ def test_record_that_is_none_is_refused_as_in_one_file(start: Start, kind: Recor
     with pytest.raises(ValueError, match=sentence):
         run.log.write_record(kind, b"?")
     run.log.close()
+
+
+# A log of one file that is being written: each look has what is new, once
+
+
+@pytest.fixture
+def written(log: LogWriter, path: Path, cycle: Callable[[int], bytes]) -> bytes:
+    """The bytes of a log with 400 cycles in 20 chunks and an event in each."""
+    events = EventRing(Handover(log.write_record), VirtualClock())
+    for number in range(400):
+        log.write_record(RecordKind.CYCLE, cycle(number))
+        if number % 20 == 19:
+            events.emit_event("arm", EventBody(EventCode.CONTROLLER_SAYS, Severity.INFO, f"cycle {number}"))
+            log.finish_chunk()
+    batch = PacketBatch(Handover(log.write_record))
+    batch.packet(0, PacketKind.INSTRUCTION, 1, 10, 11, bytes.fromhex("ffff0104022406ce"))
+    batch.commit_packets()
+    log.close()
+    return path.read_bytes()
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_everything_comes_once_however_the_file_grows(written: bytes, tmp_path: Path, seed: int) -> None:
+    rng, path = random.Random(seed), tmp_path / "growing.mcap"
+    begin = written.index(b"plan.json") + 2000
+    ends = sorted(rng.randrange(begin, len(written)) for _ in range(30))
+    cycles, texts = [], []
+    with path.open("wb", buffering=0) as file:
+        file.write(written[:begin])
+        follower = LogFollower(path)
+        for end in (*ends, len(written), len(written)):
+            file.write(written[file.tell() : end])
+            new = follower.new()
+            cycles += new.cycles["cycle"].tolist()
+            texts += [event.text for event in new.events]
+    assert cycles == list(range(400))
+    assert texts == [f"cycle {number}" for number in range(19, 400, 20)]
+
+
+def test_follower_has_the_log_without_its_packets_and_misses_a_file_that_is_gone(
+    written: bytes, path: Path
+) -> None:
+    whole, follower = read_log(path), LogFollower(path)
+    followed = follower.new()
+    assert whole.cycles.tobytes() == followed.cycles.tobytes()
+    assert (len(whole.packets), len(followed.packets)) == (1, 0)
+    assert (followed.attachments, followed.header) == (whole.attachments, whole.header)
+    path.unlink()
+    with pytest.raises(LogError, match="cannot be read"):
+        follower.new()

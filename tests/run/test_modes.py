@@ -120,6 +120,7 @@ def said_to(run: SampledRun, bus: BusPlan, servo_id: int) -> Iterator[tuple[int,
 def test_what_selects_a_mode_is_written_without_torque_and_no_goal_comes_meanwhile(ran):
     protocol, run, _ = ran
     case = CASES[protocol]
+    assert run.plan.buses
     for bus in run.plan.buses:
         for servo in bus.servos:
             torque, changed = 0, 0

@@ -64,7 +64,9 @@ def test_tables_stand_where_a_foreign_list_has_them() -> None:
 
 @pytest.mark.parametrize("kind", ["Ax", "Mx", "Xl430"])
 def test_model_numbers_are_those_of_a_foreign_list(kind: str) -> None:
-    for name, number in getattr(rustypot, f"{kind}PyController").models().items():
+    numbers = getattr(rustypot, f"{kind}PyController").models()
+    assert numbers
+    for name, number in numbers.items():
         (table,) = models_by_number(number, 2.0 if kind == "Xl430" else 1.0)
         wanted = {"AX12": "AX12A", "XL430W2502": "2XL430W250"}.get(name, name)
         assert table.model.replace("-", "") == wanted
