@@ -14,6 +14,7 @@ import math
 import random
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 
 import pytest
 from tests.kit.campaigns import campaign
@@ -41,27 +42,13 @@ KINDS = {
     **{f"stall of {late} ms": PacketFault(STALLED, bytes, late * 1_000_000) for late in (90, 300)},
 }
 MODELS = {1.0: "MX-28", 2.0: "XM430-W350"}
+COMMON = {"return_delay_time": 111, "temperature_limit": 71}
 ODD = {
-    1.0: {
-        "return_delay_time": 111,
-        "cw_angle_limit": 2040,
-        "ccw_angle_limit": 2060,
-        "multi_turn_offset": 77,
-        "resolution_divider": 3,
-        "temperature_limit": 71,
-    },
-    2.0: {
-        "return_delay_time": 111,
-        "drive_mode": 4,
-        "homing_offset": 77,
-        "min_position_limit": 2040,
-        "max_position_limit": 2060,
-        "startup_configuration": 3,
-        "profile_acceleration": 55,
-        "temperature_limit": 71,
-        "velocity_limit": 210,
-        "position_p_gain": 640,
-    },
+    1.0: COMMON
+    | {"cw_angle_limit": 2040, "ccw_angle_limit": 2060, "multi_turn_offset": 77, "resolution_divider": 3},
+    2.0: COMMON
+    | {"drive_mode": 4, "homing_offset": 77, "min_position_limit": 2040, "max_position_limit": 2060}
+    | {"startup_configuration": 3, "profile_acceleration": 55, "velocity_limit": 210, "position_p_gain": 640},
 }
 """Settings that a start reports, each with a value of its own."""
 SILENT = re.compile(
@@ -107,8 +94,8 @@ def refused_start(protocol: float, faults: Faults) -> tuple[set[str], int]:
 
 def start(protocol: float, faults: Faults) -> tuple[set[str], int]:
     rig = make_rig(plan_of(protocol))
-    for name in ("temperature_limit", "return_delay_time"):
-        rig.buses[0].servo(1).poke(name, ODD[protocol][name])
+    for name, value in COMMON.items():
+        rig.buses[0].servo(1).poke(name, value)
     replies = disturb_replies(rig.buses[0], 1, faults)
     sentences: Sequence[str] = ()
     try:
@@ -166,17 +153,19 @@ def servo(protocol: float, faults: Faults) -> tuple[set[str], int]:
     one = OneServo(tool, found)
     replies = disturb_replies(line.bus, 1, faults)
     said: list[str] = []
-    singles = ["temperature_limit", "return_delay_time", "id", "led", "torque_enable"]
-    for names in (*([name] for name in singles), list(ODD[protocol])):
-        try:
-            said += [f"{name} {value}" for name, value in one.read_items(names).items()]
-        except ServoFault as error:
-            said += error.sentences
-    for act in (
+
+    def read(*names: str) -> list[str]:
+        return [f"{name} {value}" for name, value in one.read_items(list(names)).items()]
+
+    singles = "temperature_limit", "return_delay_time", "id", "led", "torque_enable"
+    acts: list[Callable[[], Iterable[str]]] = [
+        *(partial(read, name) for name in singles),
+        lambda: read(*ODD[protocol]),
         lambda: one.write_registers([one.register("temperature_limit", 65)]),
         lambda: one.torque(True),
         lambda: one.torque(False),
-    ):
+    ]
+    for act in acts:
         try:
             said += act()
         except ServoFault as error:

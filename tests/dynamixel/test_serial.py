@@ -9,6 +9,7 @@ import sys
 import termios
 import time
 import tty
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
@@ -36,10 +37,8 @@ def terminal():
     master, slave = pty.openpty()
     yield master, os.ttyname(slave), slave
     for descriptor in (master, slave):
-        try:
+        with suppress(OSError):
             os.close(descriptor)
-        except OSError:
-            continue
 
 
 @pytest.fixture
@@ -114,9 +113,13 @@ def test_a_line_that_takes_nothing_is_a_port_error(opened):
         port.write_packet(bytes(100_000))
 
 
-def test_a_missing_device_is_named():
+def test_a_missing_device_and_a_file_are_named(tmp_path):
     with pytest.raises(PortError, match=r"port /dev/ttyNOPE not found; (choose from /dev|plug in a serial)"):
         open_serial("/dev/ttyNOPE", 1_000_000)
+    path = tmp_path / "file"
+    path.touch()
+    with pytest.raises(PortError, match="is not a serial line"):
+        open_serial(str(path), 1_000_000)
 
 
 class Driver:
@@ -171,6 +174,8 @@ def test_a_rate_beyond_two_percent_is_left_out_by_tools(terminal, monkeypatch):
 
 def test_rs485_is_switched_on_or_refused(terminal, monkeypatch):
     _, path, _ = terminal
+    with open_serial(path, 1_000_000, rs485=True):
+        pass  # a simulated line needs none
     driver = Driver(monkeypatch)
     with open_serial(path, 1_000_000):
         assert driver.rs485 == []
@@ -181,11 +186,6 @@ def test_rs485_is_switched_on_or_refused(terminal, monkeypatch):
         open_serial(path, 1_000_000, rs485=True)
     with open_serial(path, 1_000_000):
         pass  # what was refused let go of it
-
-
-def test_a_simulated_line_needs_no_rs485(terminal):
-    with open_serial(terminal[1], 1_000_000, rs485=True):
-        pass
 
 
 def test_a_board_that_resets_when_it_is_opened_gets_time_once(terminal, monkeypatch):
@@ -201,47 +201,34 @@ def test_a_board_that_resets_when_it_is_opened_gets_time_once(terminal, monkeypa
     assert slept == [2.0]
 
 
-def test_a_file_is_no_serial_line(tmp_path):
-    path = tmp_path / "file"
-    path.touch()
-    with pytest.raises(PortError, match="is not a serial line"):
-        open_serial(str(path), 1_000_000)
-
-
-def test_the_process_that_has_the_line_is_named(terminal):
-    _, path, _ = terminal
+@contextmanager
+def holder(path, *more):
+    """Run a process that has the line open."""
     code = (
-        "import sys\n"
+        "import sys\nfrom dxlrun.channels import child_processes\n"
         "from dxlwire.port.serial_open import open_serial\n"
-        "port = open_serial(sys.argv[1], 1_000_000)\n"
-        "print('opened', flush=True)\n"
+        "port = open_serial(sys.argv[1], 1_000_000)\n" + "".join(more) + "print('opened', flush=True)\n"
         "sys.stdin.read()\n"
     )
     command = [sys.executable, "-c", code, path]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as holder:
-        assert holder.stdout.readline() == "opened\n"
-        with pytest.raises(PortError, match="is in use by") as error:
-            open_serial(path, 1_000_000)
-        holder.stdin.close()
-    assert f"(process {holder.pid})" in str(error.value)
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout.readline() == "opened\n"
+        yield process
+        process.stdin.close()
+
+
+def test_the_process_that_has_the_line_is_named(terminal):
+    with holder(terminal[1]) as process, pytest.raises(PortError, match="is in use by") as error:
+        open_serial(terminal[1], 1_000_000)
+    assert f"(process {process.pid})" in str(error.value)
 
 
 def test_the_run_that_has_the_line_is_named_and_how_to_end_it(terminal):
     """A guardian has the line and the plan's memory open."""
-    _, path, _ = terminal
-    code = (
-        "import sys\n"
-        "from dxlrun.channels import child_processes\n"
-        "from dxlwire.port.serial_open import open_serial\n"
-        "port = open_serial(sys.argv[1], 1_000_000)\n"
-        'plan = child_processes.memory_file(\'dxlrun-plan\', b\'{"robot":"pan_tilt","loop":{}}\')\n'
-        "print('opened', flush=True)\n"
-        "sys.stdin.read()\n"
-    )
-    command = [sys.executable, "-c", code, path]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as run:
-        assert run.stdout.readline() == "opened\n"
-        fcntl.ioctl(terminal[2], termios.TIOCNXCL)  # root may open it all the same; the flock stays
+    _, path, slave = terminal
+    plan = 'plan = child_processes.memory_file("dxlrun-plan", b\'{"robot":"pan_tilt","loop":{}}\')\n'
+    with holder(path, plan):
+        fcntl.ioctl(slave, termios.TIOCNXCL)  # root may open it all the same; the flock stays
         with pytest.raises(PortError) as refused:
             dxlrun.open_serial(path, 1_000_000)
     assert str(refused.value) == (

@@ -23,29 +23,26 @@ from dxlsim.simulation_plan import BusConfig, ServoConfig
 from dxlwire.control_table import all_tables, find_table
 
 NUMBERS = ControlTable.parsingModelList()
-MODELS = tuple(
+MODELS = [
     table.model
     for table in all_tables()
     if table.protocol == 2.0 and table.model_number in NUMBERS and not table.model.endswith("-FW51")
-)
+]
 """Every model of which both know a table."""
 POSITION = 1.0
 """rad, of every servo at the start: also a gripper reaches it."""
-
-
-def line(name: str, *models: str) -> BusConfig:
-    servos = tuple(ServoConfig(each, model, POSITION) for each, model in enumerate(models, start=1))
-    return BusConfig(name, 1_000_000, servos, 2.0)
-
-
-BUSES = (
-    line("models", *MODELS),
-    line("modes", "XM430-W350"),
-    line("settings", "XM430-W350"),
-    line("group", "XM430-W350", "XM430-W350"),
-    line("guarded", "XM430-W350"),
-    line("reset", "XL430-W250"),
-)
+LINES = {
+    "models": MODELS,
+    "modes": ["XM430-W350"],
+    "settings": ["XM430-W350"],
+    "guarded": ["XM430-W350"],
+    "group": ["XM430-W350"] * 2,
+    "reset": ["XL430-W250"],
+}
+BUSES = [
+    BusConfig(name, 1_000_000, tuple(ServoConfig(n, each, POSITION) for n, each in enumerate(models, 1)), 2.0)
+    for name, models in LINES.items()
+]
 
 
 @pytest.fixture
@@ -66,15 +63,12 @@ def connect(simulation: Any, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callab
 def test_it_finds_every_model_and_reads_it_by_its_own_table(connect: Any) -> None:
     bus = connect("models")
     bus._port_handler.wanted = len(MODELS) * 14
-    found = bus.broadcastPing()
-    assert list(found) == list(range(1, len(MODELS) + 1))
+    assert list(bus.broadcastPing()) == list(range(1, len(MODELS) + 1))
     for servo_id, model in enumerate(MODELS, start=1):
         if model == "XL-320":
             continue  # its file there has no operating mode, and a Motor reads it at once
-        motor = bus.createMotor(servo_id)
-        table = find_table(model, 2.0)
-        assert motor.model_number == table.model_number
-        assert motor.torque_status == 0
+        motor, table = bus.createMotor(servo_id), find_table(model, 2.0)
+        assert (motor.model_number, motor.torque_status) == (table.model_number, 0)
         assert motor.operating_mode_status in (OperatingMode.POSITION, OperatingMode.CURRENT_BASED_POSITION)
         assert abs(motor.getPresentPosition() * table.rad_per_tick - POSITION) < 0.01, model
 
@@ -88,10 +82,9 @@ def test_a_motor_moves_in_position_and_velocity_mode(connect: Any) -> None:
     motor.disableTorque()
     motor.setOperatingMode(OperatingMode.VELOCITY)
     motor.enableTorque()
-    motor.setGoalVelocity(60)
-    assert until(lambda: motor.getPresentVelocity() > 40)
-    motor.setGoalVelocity(-60)
-    assert until(lambda: motor.getPresentVelocity() < -40)
+    for sign in (1, -1):
+        motor.setGoalVelocity(60 * sign)
+        assert until(lambda sign=sign: motor.getPresentVelocity() * sign > 40)
     motor.disableTorque()
     assert until(lambda: motor.getPresentVelocity() == 0)
 
@@ -125,11 +118,11 @@ def test_a_group_reads_and_writes_by_sync_and_by_bulk(connect: Any) -> None:
     group.executeWrite()
     assert [one.isTorqueOn(), other.isTorqueOn()] == [1, 1]
     group.clearStagedWriteCommands()
-    group.addCmd(one.stageSetGoalPosition(800))
-    group.addCmd(other.stageLEDOn())
+    for command in (one.stageSetGoalPosition(800), other.stageLEDOn()):
+        group.addCmd(command)
     group.executeWrite()
-    group.addCmd(one.stageGetPresentPosition())
-    group.addCmd(other.stageIsLEDOn())
+    for command in (one.stageGetPresentPosition(), other.stageIsLEDOn()):
+        group.addCmd(command)
 
     def arrived() -> bool:
         position, led = group.executeRead()

@@ -13,9 +13,6 @@ from dxlsim.simulation_plan import BusConfig, ServoConfig
 from dxlwire.control_table import find_table
 
 RATE = 1_000_000
-POSITION = 2.0
-"""rad from raw 0, of every servo at the start."""
-
 MODELS = {
     "Ax": ("AX-12A", 1.0),
     "Mx": ("MX-28", 1.0),
@@ -26,23 +23,24 @@ MODELS = {
 """By its class: a model, and the protocol."""
 
 
-def line(name: str, kind: str, count: int = 2) -> BusConfig:
-    model, protocol = MODELS[kind]
-    servos = tuple(ServoConfig(each, model, POSITION) for each in range(1, count + 1))
+def line(name: str, protocol: float, *models: str) -> BusConfig:
+    """All servos stand at 2 rad from raw 0."""
+    servos = tuple(ServoConfig(each, model, 2.0) for each, model in enumerate(models, 1))
     return BusConfig(name, RATE, servos, protocol)
 
 
-MIXED = (ServoConfig(1, "XL430-W250", POSITION), ServoConfig(2, "XL330-M288", POSITION))
 BUSES = (
-    *(line(f"read {kind}", kind, 1) for kind in MODELS),
-    *(line(f"drive {kind}", kind) for kind in MODELS),
-    *(line(f"refuse {kind}", kind, 1) for kind in MODELS),
-    BusConfig("mixed", RATE, MIXED, 2.0),
-    BusConfig("moved", RATE, MIXED, 2.0),
-    line("many", "Xl330", 8),
-    line("restarted", "Xl430", 1),
-    line("stuffed", "Xl330", 1),
+    *(
+        line(f"{use} {kind}", MODELS[kind][1], *[MODELS[kind][0]] * 2)
+        for kind in MODELS
+        for use in ("read", "drive")
+    ),
+    *(line(name, 2.0, "XL430-W250", "XL330-M288") for name in ("mixed", "moved")),
+    line("many", 2.0, *["XL330-M288"] * 8),
+    line("restarted", 2.0, "XL430-W250"),
+    line("stuffed", 2.0, "XL330-M288"),
 )
+every = pytest.mark.parametrize("kind", MODELS)
 
 
 @pytest.fixture
@@ -51,8 +49,7 @@ def connect(simulation: Any) -> Iterator[Callable[[str, str], Any]]:
     opened: list[Any] = []
 
     def open_bus(name: str, kind: str) -> Any:
-        controller = getattr(rustypot, f"{kind}PyController")
-        opened.append(controller(simulation.ports[name], RATE, DEADLINE_S))
+        opened.append(getattr(rustypot, f"{kind}PyController")(simulation.ports[name], RATE, DEADLINE_S))
         return opened[-1]
 
     yield open_bus
@@ -60,11 +57,12 @@ def connect(simulation: Any) -> Iterator[Callable[[str, str], Any]]:
         each.close()
 
 
-@pytest.mark.parametrize("kind", MODELS)
+@every
 def test_every_register_is_read_and_written_back_where_its_table_has_it(
     connect: Any, simulation: Any, kind: str
 ) -> None:
-    servo = connect(f"read {kind}", kind)
+    bus = f"read {kind}"
+    servo = connect(bus, kind)
     access = {item.address: item.access for item in find_table(*MODELS[kind]).items.values()}
     written = 0
     for register in servo.registers():
@@ -75,13 +73,15 @@ def test_every_register_is_read_and_written_back_where_its_table_has_it(
         if register.access == rustypot.RegisterAccess.ReadWrite:
             # Its table of the XL330 takes some that the manual calls read-only for writable.
             allowed = access[register.addr] == "RW"
-            simulation.expect_refusals(f"read {kind}", not allowed)
+            simulation.expect_refusals(bus, not allowed)
             assert (servo.write_register_with_error(1, register.name, value) == 0) == allowed, register.name
             written += allowed
     assert written > 15
+    simulation.expect_refusals(bus, 1)  # the error of a value out of range is that of the protocol
+    assert servo.write_register_with_error(2, "torque_enable", 2) == (8 if MODELS[kind][1] == 1.0 else 4)
 
 
-@pytest.mark.parametrize("kind", MODELS)
+@every
 def test_two_servos_are_found_and_driven_by_a_sync_write(connect: Any, simulation: Any, kind: str) -> None:
     simulation.expect_haste(f"drive {kind}")
     bus = connect(f"drive {kind}", kind)
@@ -100,15 +100,6 @@ def test_two_servos_are_found_and_driven_by_a_sync_write(connect: Any, simulatio
     assert until(arrived)
 
 
-@pytest.mark.parametrize("kind", MODELS)
-def test_a_value_out_of_range_gets_the_error_of_its_protocol(
-    connect: Any, simulation: Any, kind: str
-) -> None:
-    servo = connect(f"refuse {kind}", kind)
-    simulation.expect_refusals(f"refuse {kind}", 1)
-    assert servo.write_register_with_error(1, "torque_enable", 2) == (8 if MODELS[kind][1] == 1.0 else 4)
-
-
 @pytest.mark.parametrize("kind", ["Ax", "Mx"])
 def test_nobody_answers_a_sync_read_of_protocol_1(connect: Any, simulation: Any, kind: str) -> None:
     bus = connect(f"drive {kind}", kind)
@@ -125,8 +116,7 @@ def test_angles_are_radians_around_the_middle(connect: Any) -> None:
 
 
 def test_a_fast_sync_read_of_eight_servos_tells_what_a_sync_read_does(connect: Any) -> None:
-    bus = connect("many", "Xl330")
-    ids = list(range(1, 9))
+    bus, ids = connect("many", "Xl330"), list(range(1, 9))
     slow = bus.sync_read_raw_data(ids, 132, 4)
     bus.set_fast_sync_read(True)
     fast = bus.sync_read_raw_data(ids, 132, 4)
@@ -147,16 +137,12 @@ def test_a_reboot_and_a_factory_reset_are_answered(connect: Any, simulation: Any
     servo = connect("restarted", "Xl430")
     servo.write_register(1, "return_delay_time", 0)
     servo.write_register(1, "led", 1)
-    assert servo.reboot(1)
-    servo.set_timeout(0.05)
-    assert until(lambda: bool(servo.ping(1)))
-    servo.set_timeout(DEADLINE_S)
-    assert (servo.read_register(1, "led"), servo.read_register(1, "return_delay_time")) == (0, 0)
-    servo.factory_reset(1)
-    servo.set_timeout(0.05)
-    assert until(lambda: bool(servo.ping(1)))
-    servo.set_timeout(DEADLINE_S)
-    assert servo.read_register(1, "return_delay_time") == 250
+    for restart, expected in ((servo.reboot, (0, 0)), (servo.factory_reset, (0, 250))):
+        restart(1)
+        servo.set_timeout(0.05)
+        assert until(lambda: bool(servo.ping(1)))
+        servo.set_timeout(DEADLINE_S)
+        assert (servo.read_register(1, "led"), servo.read_register(1, "return_delay_time")) == expected
 
 
 def test_servos_of_two_kinds_share_a_line(simulation: Any) -> None:

@@ -20,50 +20,16 @@ import tty
 from contextlib import suppress
 from dataclasses import dataclass, field
 
-PING, READ, WRITE, REG_WRITE, ACTION, SYNC_WRITE = 1, 2, 3, 4, 5, 0x83
+READ, WRITE, REG_WRITE, ACTION, SYNC_WRITE = 2, 3, 4, 5, 0x83
 BROADCAST = 0xFE
-TORQUE, GOAL, SPEED, POSITION = 24, 30, 32, 36
-BYTE_S = 10 / 1_000_000
+TORQUE, GOAL, POSITION, SIZE = 24, 30, 36, 50
+BYTE_S, RETURN_DELAY_S = 10 / 1_000_000, 100e-6
 """At 1 Mbit/s."""
-RETURN_DELAY_S = 100e-6
-SIZE = 50
-
-
-def registers(servo_id: int) -> bytearray:
-    """Return the registers of a fresh servo at 512 ticks."""
-    table = bytearray(SIZE)
-    for address, size, value in (
-        (0, 2, 12),  # model number
-        (2, 1, 24),  # firmware
-        (3, 1, servo_id),
-        (4, 1, 1),  # baud rate
-        (5, 1, 50),  # return delay, 2 us
-        (8, 2, 1023),  # CCW angle limit
-        (11, 1, 70),  # temperature limit
-        (12, 1, 60),
-        (13, 1, 140),
-        (14, 2, 1023),  # maximum torque
-        (16, 1, 2),  # status return level
-        (17, 1, 36),
-        (18, 1, 36),  # shutdown
-        (26, 1, 1),  # compliance
-        (27, 1, 1),
-        (28, 1, 32),
-        (29, 1, 32),
-        (GOAL, 2, 512),
-        (34, 2, 1023),  # torque limit
-        (POSITION, 2, 512),
-        (42, 1, 120),  # voltage
-        (43, 1, 30),  # temperature
-        (48, 2, 32),  # punch
-    ):
-        table[address : address + size] = value.to_bytes(size, "little")
-    return table
-
-
-def checksum(content: bytes) -> int:
-    """Return the checksum of a packet's bytes from ID on."""
-    return ~sum(content) & 0xFF
+FRESH = bytes.fromhex(
+    "0c00 18 00 01 32 0000 ff03 00 46 3c 8c ff03 02 24 24 0000000000"  # model number to shutdown
+    "00 00 01 01 20 20 0002 0000 ff03 0002 0000 0000 78 1e 0000 0000 2000"  # torque enable to punch
+)
+"""Registers of a servo at 512 ticks; its ID is at 3."""
 
 
 @dataclass
@@ -82,11 +48,11 @@ class Servos:
 
     def write(self, servo: int, address: int, data: bytes) -> None:
         """Write registers. A goal switches torque on, as it does on an AX-12A; the shaft is there at once."""
-        table = self.tables[servo]
+        table, written = self.tables[servo], range(address, address + len(data))
         table[address : address + len(data)] = data
-        if address <= TORQUE < address + len(data):
+        if TORQUE in written:
             self.note("torque", servo, table[TORQUE])
-        if address <= GOAL < address + len(data):
+        if GOAL in written:
             self.note("goal", servo, int.from_bytes(table[GOAL : GOAL + 2], "little"))
             if not table[TORQUE]:
                 table[TORQUE] = 1
@@ -116,9 +82,9 @@ class Servos:
         if instruction == READ:
             data = bytes(self.tables[servo][parameters[0] : parameters[0] + parameters[1]])
         content = bytes((servo, len(data) + 2, 0)) + data
-        return b"\xff\xff" + content + bytes((checksum(content),))
+        return b"\xff\xff" + content + bytes((~sum(content) & 0xFF,))
 
-    def take(self, pending: bytes, reply: object) -> bytes:
+    def serve(self, pending: bytes, terminal: int) -> bytes:
         """Execute each whole instruction packet; return the bytes that are not one yet."""
         while (start := pending.find(b"\xff\xff")) >= 0 and len(pending) >= start + 6:
             servo, length = pending[start + 2], pending[start + 3]
@@ -129,12 +95,11 @@ class Servos:
             if len(pending) < end:
                 return pending[start:]
             packet, pending = pending[start:end], pending[end:]
-            if checksum(packet[2:-1]) != packet[-1]:
+            if ~sum(packet[2:-1]) & 0xFF != packet[-1] or servo not in {*self.tables, BROADCAST}:
                 continue
-            if servo in self.tables or servo == BROADCAST:
-                status = self.execute(servo, packet[4], packet[5:-1])
-                if status:
-                    reply(len(packet), status)  # type: ignore[operator]
+            if status := self.execute(servo, packet[4], packet[5:-1]):
+                time.sleep((len(packet) + len(status)) * BYTE_S + RETURN_DELAY_S)
+                os.write(terminal, status)
         return pending
 
 
@@ -147,17 +112,12 @@ def main() -> None:
     journal = os.open(sys.argv[1], os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
     print(os.ttyname(slave), flush=True)
     os.close(slave)  # whoever opens it later is the only one
-    servos = Servos(journal, {int(one): registers(int(one)) for one in sys.argv[2:]})
-
-    def reply(heard: int, status: bytes) -> None:
-        time.sleep((heard + len(status)) * BYTE_S + RETURN_DELAY_S)
-        os.write(master, status)
-
-    pending = b""
+    tables = {int(one): bytearray(FRESH[:3] + bytes((int(one),)) + FRESH[4:]) for one in sys.argv[2:]}
+    servos, pending = Servos(journal, tables), b""
     while True:
         select.select([master], [], [])
         try:
-            pending = servos.take(pending + os.read(master, 4096), reply)
+            pending = servos.serve(pending + os.read(master, 4096), master)
         except OSError:  # nobody has the terminal open
             pending = b""
             time.sleep(0.005)

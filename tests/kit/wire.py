@@ -29,21 +29,19 @@ class Facts(NamedTuple):
     items: Mapping[Item, tuple[int, int]]
 
 
+X430: Mapping[Item, tuple[int, int]] = {
+    "torque_enable": (64, 1),
+    "goal_position": (116, 4),
+    "present_position": (132, 4),
+    "goal_current": (102, 2),
+    "operating_mode": (11, 1),
+}
 FACTS: Mapping[str, Facts] = {
     "AX-12A": Facts(
         math.radians(300) / 1023,
         {"torque_enable": (24, 1), "goal_position": (30, 2), "present_position": (36, 2)},
     ),
-    "XM430-W350": Facts(
-        math.tau / 4096,
-        {
-            "torque_enable": (64, 1),
-            "goal_position": (116, 4),
-            "present_position": (132, 4),
-            "goal_current": (102, 2),
-            "operating_mode": (11, 1),
-        },
-    ),
+    "XM430-W350": Facts(math.tau / 4096, X430),
 }
 
 
@@ -52,11 +50,20 @@ def angle(servo: ServoPlan, raw: int) -> float:
     return servo.direction * (raw * FACTS[servo.model].rad_per_tick - servo.reference)
 
 
+def value_at(servo: ServoPlan, item: Item, address: int, data: bytes) -> int | None:
+    """Return an item's value in bytes from an address on; None: they do not have it."""
+    place, size = FACTS[servo.model].items.get(item, (-1, 0))
+    at = place - address
+    if size == 0 or not 0 <= at <= len(data) - size:
+        return None
+    return int.from_bytes(data[at : at + size], "little", signed=size == 4)
+
+
 def stands_at(servo: ServoPlan, state: bytes) -> float:
     """Return the joint's angle, rad, in a block of state that begins where the plan reads it."""
-    address, size = FACTS[servo.model].items["present_position"]
-    at = address - servo.state.address
-    return angle(servo, int.from_bytes(state[at : at + size], "little", signed=size == 4))
+    raw = value_at(servo, "present_position", servo.state.address, state)
+    assert raw is not None
+    return angle(servo, raw)
 
 
 class Instruction(NamedTuple):
@@ -100,30 +107,34 @@ def taken_apart(entries: Iterable[LedgerEntry], protocol: float) -> Iterator[Ins
     for entry in entries:
         data = entry.data if entry.direction == "in" else b""
         while data:
-            servo_id, instruction, parameters, data = _first(data, protocol)
-            yield Instruction(entry.t_ns, servo_id, instruction, parameters)
+            end = packet_end(data, protocol)
+            assert end, data.hex(" ")
+            yield Instruction(entry.t_ns, *opened(data[:end], protocol))
+            data = data[end:]
+
+
+def packet_end(data: bytes, protocol: float) -> int:
+    """Return the size of the whole packet with which bytes begin; 0: there is none, or it is damaged."""
+    if protocol == 1.0:
+        end = 4 + data[3] if len(data) > 5 and data[:2] == b"\xff\xff" else 0
+        return end if 5 < end <= len(data) and sum(data[2:end]) & 0xFF == 0xFF else 0
+    end = 7 + int.from_bytes(data[5:7], "little") if data.startswith(HEADER) else 0
+    if not 9 < end <= len(data) or crc(data[: end - 2]) != int.from_bytes(data[end - 2 : end], "little"):
+        return 0
+    return end
+
+
+def opened(packet: bytes, protocol: float) -> tuple[int, int, bytes]:
+    """Return ID, instruction (or error of Protocol 1.0) and parameters of a packet."""
+    if protocol == 1.0:
+        return packet[2], packet[4], packet[5:-1]
+    return packet[4], packet[7], packet[8:-2].replace(b"\xff\xff\xfd\xfd", b"\xff\xff\xfd")
 
 
 def commands(sent: Collection[Instruction], protocol: float) -> set[tuple[int, int, bytes]]:
     """Return servo, address and bytes of all that was written, each once; a reboot writes nothing at 0."""
     found = {one for each in sent for one in writes(each, protocol)}
     return found | {(one.servo_id, 0, b"") for one in sent if one.instruction == REBOOT}
-
-
-def _first(data: bytes, protocol: float) -> tuple[int, int, bytes, bytes]:
-    """Return ID, instruction and parameters of the first packet, and what follows it."""
-    if protocol == 1.0:
-        assert data[:2] == b"\xff\xff", data.hex(" ")
-        end = 4 + data[3]
-        assert len(data) >= end, data.hex(" ")
-        assert sum(data[2:end]) & 0xFF == 0xFF, data.hex(" ")
-        return data[2], data[4], data[5 : end - 1], data[end:]
-    assert data[:4] == HEADER, data.hex(" ")
-    end = 7 + int.from_bytes(data[5:7], "little")
-    assert len(data) >= end, data.hex(" ")
-    assert crc(data[: end - 2]) == int.from_bytes(data[end - 2 : end], "little"), data.hex(" ")
-    parameters = data[8 : end - 2].replace(b"\xff\xff\xfd\xfd", b"\xff\xff\xfd")
-    return data[4], data[7], parameters, data[end:]
 
 
 def writes(sent: Instruction, protocol: float) -> Iterator[tuple[int, int, bytes]]:
@@ -151,13 +162,13 @@ def all_writes(entries: Sequence[LedgerEntry], bus: BusPlan) -> Iterator[tuple[i
 
 def written(sent: Sequence[Instruction], bus: BusPlan, item: Item) -> Iterator[tuple[int, ServoPlan, int]]:
     """Return when which servo got which value in an item."""
-    places = [(servo, *FACTS[servo.model].items[item]) for servo in bus.servos]
     for one in sent:
         for servo_id, address, data in writes(one, bus.protocol):
-            for servo, place, size in places:
-                at = place - address
-                if servo_id in (servo.servo_id, BROADCAST) and 0 <= at <= len(data) - size:
-                    yield one.t_ns, servo, int.from_bytes(data[at : at + size], "little", signed=size == 4)
+            for servo in bus.servos:
+                if servo_id in (servo.servo_id, BROADCAST):
+                    value = value_at(servo, item, address, data)
+                    if value is not None:
+                        yield one.t_ns, servo, value
 
 
 def states(entries: Sequence[LedgerEntry], bus: BusPlan) -> Iterator[StateReply]:
@@ -165,39 +176,27 @@ def states(entries: Sequence[LedgerEntry], bus: BusPlan) -> Iterator[StateReply]
 
     The host asks for some bytes more now and then, to distinguish a late reply from the one it waits for.
     """
-    lengths = {
-        length
-        for servo in bus.servos
-        for length in range(servo.state.length, servo.state.length + servo.state.spare + 1)
-    }
-    of_protocol = _states1 if bus.protocol == 1.0 else _states2
+    layouts = [servo.state for servo in bus.servos]
+    lengths = {one.length + more for one in layouts for more in range(one.spare + 1)}
     sent = [entry for entry in entries if entry.direction == "out"]
-    found = [each for entry in sent for each in of_protocol(entry) if len(each.data) in lengths]
+    found = [each for entry in sent for each in _statuses(entry, bus.protocol) if len(each.data) in lengths]
     if bus.protocol == 2.0:
         found += _shared(sent, sorted(lengths))
     yield from sorted(found)
 
 
-def _states1(entry: LedgerEntry) -> Iterator[StateReply]:
-    rest = entry.data
-    while (start := rest.find(b"\xff\xff")) >= 0:
+def _statuses(entry: LedgerEntry, protocol: float) -> Iterator[StateReply]:
+    """Yield whole status packets, wherever they are among the bytes."""
+    rest, header = entry.data, b"\xff\xff" if protocol == 1.0 else HEADER
+    while (start := rest.find(header)) >= 0:
         rest = rest[start:]
-        body = rest[: 4 + (rest[3] if len(rest) > 5 else 0)]
-        if len(body) > 5 and len(body) == 4 + body[3] and sum(body[2:]) & 0xFF == 0xFF:
-            yield StateReply(entry.t_ns, body[2], body[5:-1])
-        rest = rest[1:]
-
-
-def _states2(entry: LedgerEntry) -> Iterator[StateReply]:
-    rest = entry.data
-    while (start := rest.find(HEADER)) >= 0:
-        rest = rest[start:]
-        end = 7 + int.from_bytes(rest[5:7], "little")
-        if len(rest) >= end and crc(rest[: end - 2]) == int.from_bytes(rest[end - 2 : end], "little"):
-            servo_id, instruction, parameters, _ = _first(rest, 2.0)
-            if instruction == STATUS:
-                yield StateReply(entry.t_ns, servo_id, parameters[1:])
-        rest = rest[4:]
+        if end := packet_end(rest, protocol):
+            servo_id, kind, data = opened(rest[:end], protocol)
+            if protocol == 1.0:
+                yield StateReply(entry.t_ns, servo_id, data)
+            elif kind == STATUS:
+                yield StateReply(entry.t_ns, servo_id, data[1:])
+        rest = rest[1 if protocol == 1.0 else 4 :]
 
 
 def _shared(sent: Sequence[LedgerEntry], lengths: Sequence[int]) -> Iterator[StateReply]:
@@ -207,15 +206,11 @@ def _shared(sent: Sequence[LedgerEntry], lengths: Sequence[int]) -> Iterator[Sta
     start = -1
     while (start := stream.find(HEADER + bytes((BROADCAST,)), start + 1)) >= 0:
         size = int.from_bytes(stream[start + 5 : start + 7], "little")
-        for length in lengths:
-            if (size - 1) % (length + 4):
-                continue
-            at = start + 8
-            while at < start + 7 + size:
+        for length in (one for one in lengths if (size - 1) % (one + 4) == 0):
+            for at in range(start + 8, start + 7 + size, length + 4):
                 end = at + 2 + length
                 if end + 2 > len(stream) or crc(stream[start:end]) != int.from_bytes(
                     stream[end : end + 2], "little"
                 ):
                     break
                 yield StateReply(times[end + 1], stream[at + 1], stream[at + 2 : end])
-                at = end + 2

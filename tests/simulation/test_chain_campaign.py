@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import json
 import random
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,10 +33,6 @@ from dxlwire.bus_plan import BusPlan
 
 MS = 1_000_000
 SYNC_WRITE = 0x83
-JOINT = (
-    "  {name}: {{bus: main, id: {number}, model: XM430-W350, reference: 180 deg, "
-    "direction: {direction}, {limits}}}\n"
-)
 LIMITS = "limits: {position: [-1.2 rad, 1.2 rad], velocity: 4 rad/s, effort: 1 A}"
 REACH = 1.2
 JOINTS = ("shoulder", "elbow", "wrist", "hand")
@@ -79,45 +75,47 @@ def draw_storm(chance: random.Random, duration_s: float) -> str:
 
 
 def built(directory: Path, chance: random.Random, duration_s: float) -> VirtualRobot:
-    text = HEAD
-    for number, name in enumerate(JOINTS, 1):
-        text += JOINT.format(name=name, number=number, direction=1 if number % 2 else -1, limits=LIMITS)
+    keys = "bus: main, model: XM430-W350, reference: 180 deg"
+    joints = "".join(
+        f"  {name}: {{{keys}, id: {number}, direction: {1 if number % 2 else -1}, {LIMITS}}}\n"
+        for number, name in enumerate(JOINTS, 1)
+    )
     path = directory / "chained.yaml"
-    path.write_text(text + CONTROLLERS + chance.choice(POLICIES))
+    path.write_text(HEAD + joints + CONTROLLERS + chance.choice(POLICIES))
     return simulated_robot(path, duration_s=duration_s, log=directory / "run.mcap")
+
+
+SWITCHES = (
+    (["arm"], []), (["turn"], []), (["arm", "turn"], []), (["arm", "turn"], ["standby"]),
+    (["standby"], ["arm", "smooth", "turn", "pid"]), (["standby"], []), ([], ["arm"]), ([], ["smooth"]),
+    (["grip"], []), (["relax"], ["grip"]), (["grip"], ["relax"]), (["pid"], []),
+)  # fmt: skip
+STREAMS = (("turn", 1), ("grip", 1), ("relax", 1), ("standby", 3))
 
 
 class Clients:
     """Requests of every kind at random times, and controllers that fail."""
 
     def __init__(self, robot: VirtualRobot, chance: random.Random, duration_s: float) -> None:
-        self.robot, self.chance, self.number = robot, chance, 0
+        self.robot, self.chance = robot, chance
         self.end_ms = round(duration_s * 1000)
-        for _ in range(chance.choice((5, 20, round(10 * duration_s)))):
-            self.at(
-                *chance.choice(
-                    (
-                        self.goal,
-                        self.goal,
-                        self.torque,
-                        self.torque,
-                        self.reboot,
-                        self.switch,
-                        self.switch,
-                        self.cancel,
-                        self.stream,
-                        self.halt,
-                    )
-                )()
-            )
+        requests = (self.goal, self.torque, self.switch) * 2 + (
+            self.reboot,
+            self.cancel,
+            self.stream,
+            self.halt,
+        )
+        for number in range(1, 1 + chance.choice((5, 20, round(10 * duration_s)))):
+            command = CommandMessage(number, *chance.choice(requests)(), "anna")
+            self.at(300, lambda command=command: robot.inbox.waiting.append(command))
         for _ in range(chance.choice((0, 0, 1, 2))):
             self.fail(chance.choice(("pid", "smooth", "arm", "turn", "grip", "standby")))
 
-    def at(self, controller: str, kind: str, data: bytes) -> None:
-        self.number += 1
-        command = CommandMessage(self.number, controller, kind, data, "anna")
-        at_ns = self.chance.randrange(300, self.end_ms) * MS
-        self.robot.buses[0].at(at_ns, lambda: self.robot.inbox.waiting.append(command))
+    def at(self, begin_ms: int, act: Callable[[], object]) -> None:
+        self.robot.buses[0].at(self.chance.randrange(begin_ms, self.end_ms) * MS, act)
+
+    def request(self, kind: str, **data: object) -> tuple[str, str, bytes]:
+        return "", kind, json.dumps(data).encode()
 
     def goal(self) -> tuple[str, str, bytes]:
         offered = load_plugins().controllers["joint_trajectory_controller"].controller
@@ -128,33 +126,26 @@ class Clients:
         return "arm", "trajectory", np.asarray(offered.prepare("trajectory", command, parameters)).tobytes()
 
     def stream(self) -> tuple[str, str, bytes]:
-        name, count = self.chance.choice((("turn", 1), ("grip", 1), ("relax", 1), ("standby", 3)))
+        name, count = self.chance.choice(STREAMS)
         return name, "positions", np.array([self.chance.uniform(-1, 1) for _ in range(count)]).tobytes()
 
     def torque(self) -> tuple[str, str, bytes]:
-        on = self.chance.random() < 0.6
-        joints = self.chance.sample(JOINTS, self.chance.choice((1, 2, 4)))
-        return (
-            "",
-            "torque",
-            json.dumps({"joints": joints, "on": on, "release": self.chance.random() < 0.6}).encode(),
+        joints, release = (
+            self.chance.sample(JOINTS, self.chance.choice((1, 2, 4))),
+            self.chance.random() < 0.6,
         )
+        return self.request("torque", joints=joints, on=self.chance.random() < 0.6, release=release)
 
     def reboot(self) -> tuple[str, str, bytes]:
         joints = self.chance.sample(JOINTS, self.chance.choice((1, 2)))
-        return "", "reboot", json.dumps({"joints": joints, "release": self.chance.random() < 0.7}).encode()
+        return self.request("reboot", joints=joints, release=self.chance.random() < 0.7)
 
     def switch(self) -> tuple[str, str, bytes]:
-        activate, deactivate = self.chance.choice((
-            (["arm"], []), (["turn"], []), (["arm", "turn"], []), (["arm", "turn"], ["standby"]),
-            (["standby"], ["arm", "smooth", "turn", "pid"]), (["standby"], []), ([], ["arm"]),
-            ([], ["smooth"]),
-            (["grip"], []), (["relax"], ["grip"]), (["grip"], ["relax"]), (["pid"], []),
-        ))  # fmt: skip
-        return "", "switch", json.dumps({"activate": activate, "deactivate": deactivate}).encode()
+        activate, deactivate = self.chance.choice(SWITCHES)
+        return self.request("switch", activate=activate, deactivate=deactivate)
 
     def cancel(self) -> tuple[str, str, bytes]:
-        return "", "cancel", b'{"controller": "arm"}'
+        return self.request("cancel", controller="arm")
 
     def halt(self) -> tuple[str, str, bytes]:
         return "", "halt", b""
@@ -163,11 +154,7 @@ class Clients:
         def breaks(*_: object) -> None:
             raise RuntimeError("a fault of the storm")
 
-        def fail() -> None:
-            loop = self.robot.robot.loop
-            loop.manager._named[name].controller.update = breaks
-
-        self.robot.buses[0].at(self.chance.randrange(400, self.end_ms) * MS, fail)
+        self.at(400, lambda: setattr(self.robot.robot.loop.manager._named[name].controller, "update", breaks))
 
 
 def active_in(log: Log) -> list[set[str]]:

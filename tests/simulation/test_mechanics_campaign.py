@@ -8,15 +8,16 @@ what the log says of their joints. CI runs a sample of 1.5 s each; the full camp
 
 from __future__ import annotations
 
+import json
 import math
 import random
 from bisect import bisect_right
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from tests.kit.campaigns import campaign
-from tests.kit.wire import FACTS, instructions, states, written
+from tests.kit.wire import FACTS, instructions, states, value_at, written
 
 from dxlrun.channels.commands import CommandMessage
 from dxlrun.channels.cycle import LIMP
@@ -38,15 +39,7 @@ MODELS = {1.0: ("AX-12A", 150, 140), 2.0: ("XM430-W350", 180, 170)}
 LASTING = ",".join(name for name in KINDS if name not in {"storm", "tip", "unplug"})
 
 
-@dataclass
-class Drawn:
-    """A robot that was drawn by chance."""
-
-    text: str
-    joints: list[str] = field(default_factory=list)
-
-
-def drawn(chance: random.Random) -> Drawn:
+def drawn(chance: random.Random) -> str:
     """Return a robot with every kind of joint, on one bus of either protocol."""
     protocol = chance.choice((1.0, 2.0))
     model, middle, reach = MODELS[protocol]
@@ -74,13 +67,11 @@ def drawn(chance: random.Random) -> Drawn:
     a, d = (chance.uniform(0.6, 1.4) * chance.choice((1, -1)) for _ in range(2))
     b, c = (chance.uniform(-0.4, 0.4) for _ in range(2))
     rows = f"[[{a:.3f}, {b:.3f}], [{c:.3f}, {d:.3f}]]"
-    inverse = np.linalg.inv(
-        np.array([[float(f"{a:.3f}"), float(f"{b:.3f}")], [float(f"{c:.3f}"), float(f"{d:.3f}")]])
-    )
+    inverse = np.linalg.inv(np.array(json.loads(rows)))
     shared = round(0.8 * room / float(np.abs(inverse).sum(axis=1).max()), 2)
     legs = [f"{{{used}, {servo()}}}" for _ in range(2)]
     joints = ["hip", "knee", "slide", "pitch", "roll", "swing", "lift"]
-    text = f"""\
+    return f"""\
 name: drawn
 loop: {{rate: {RATE}}}
 buses:
@@ -100,14 +91,12 @@ controllers:
   all: {{type: joint_group_position_controller, joints: [{", ".join(joints)}]}}
 policies: {{on_lost_servo: hold, on_returned_servo: {chance.choice(("hold", "limp"))}}}
 """
-    return Drawn(text, joints)
 
 
 def built(chance: random.Random, directory: Path, duration_s: float, *, beyond: float = 1.0) -> VirtualRobot:
     """Return a robot to which a client sends random goals; `beyond` 1: up to its limits, else beyond them."""
-    robot_of = drawn(chance)
     path = directory / "drawn.yaml"
-    path.write_text(robot_of.text)
+    path.write_text(drawn(chance))
     robot = simulated_robot(path, duration_s=duration_s, log=directory / "run.mcap")
     joints = robot.plan.loop.joints
     for number in range(1, round(duration_s * 10)):
@@ -187,9 +176,7 @@ class Spaces:
         answered: dict[int, list[tuple[int, float]]] = {each: [] for each in servos}
         for reply in states(entries, self.bus):
             servo = servos[reply.servo_id]
-            address, size = FACTS[servo.model].items["present_position"]
-            at = address - servo.state.address
-            raw = int.from_bytes(reply.data[at : at + size], "little", signed=size == 4)
+            raw = value_at(servo, "present_position", servo.state.address, reply.data)
             answered[reply.servo_id].append((reply.t_ns, coordinate(servo, raw)))
         times = {each: [t_ns for t_ns, _ in found] for each, found in answered.items()}
         compared = 0
