@@ -53,16 +53,6 @@ def test_running_robot_lists_the_same_properties() -> None:
 
 
 def test_order_of_a_robots_description_is_that_of_its_documentation() -> None:
-    names = ["robot", "rate", "paused", "began", "cycles", "skipped", "joints", "groups", "units"]
-    names += [
-        "effort_units",
-        "limits",
-        "speeds",
-        "joint_keys",
-        "controllers",
-        "sources",
-        "file",
-        "log",
-        "servos",
-    ]
-    assert [one.name for one in dataclasses.fields(RobotInfo)] == names
+    names = "robot rate paused began cycles skipped joints groups units effort_units limits speeds joint_keys"
+    fields = [one.name for one in dataclasses.fields(RobotInfo)]
+    assert " ".join(fields) == f"{names} controllers sources file log servos"
