@@ -184,9 +184,7 @@ def test_only_packages_that_run_in_the_robot_are_in_its_plan(
 
 def test_parameters_travel_as_they_were_written():
     text = PAIR.replace("    active: false\n", "    active: false\n    tolerances: {goal: 5 deg}\n")
-
     spare = compile_text(text).plan.loop.controllers[2]
-
     offer = load_plugins().controllers[spare.type].controller
     assert offer.Parameters.model_validate_json(spare.parameters).tolerances.goal == pytest.approx(
         np.radians(5)
@@ -195,8 +193,6 @@ def test_parameters_travel_as_they_were_written():
 
 def test_more_controllers_than_a_cycle_can_hold_are_refused():
     many = "".join(f"  more{number}: {{type: joint_state_broadcaster}}\n" for number in range(61))
-
     (problem,) = problems_in(PAIR + many)
-
     assert problem.what == "the file has 64 controllers, more than 63"
     assert (problem.mark.line, problem.mark.column) == (19, 1)

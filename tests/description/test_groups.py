@@ -18,7 +18,6 @@ ROBOT = robot_text("shared")
 
 def test_joints_have_what_they_share() -> None:
     robot = desk.robot(ROBOT).robot
-
     assert list(robot.joints) == ["knee", "shoulder", "elbow"]  # the order of `joints`, which is that of rows
     assert [joint.bus for joint in robot.joints.values()] == ["right", "left", "left"]
     assert [joint.direction for joint in robot.joints.values()] == [-1, 1, -1]
@@ -34,7 +33,6 @@ def test_joints_have_what_they_share() -> None:
 def test_a_group_stands_for_its_joints_wherever_they_are_named() -> None:
     description = desk.robot(ROBOT)
     robot = description.robot
-
     assert description.groups == {
         "left": ("shoulder", "elbow"),
         "right": ("knee",),
@@ -58,7 +56,6 @@ def test_a_group_stands_for_its_joints_wherever_they_are_named() -> None:
 def test_values_keep_their_places() -> None:
     description = desk.robot(ROBOT)
     file, marks = str(description.path), description.marks
-
     assert marks.key("joints", "knee", "model") == Mark(file, 5, 3)
     assert marks.value("joints", "elbow", "registers", "position_p_gain") == Mark(file, 11, 50)
     assert marks.value("joints", "shoulder", "registers", "position_d_gain") == Mark(file, 16, 87)
@@ -78,7 +75,6 @@ def test_motions_name_groups() -> None:
         "  - {time: 1 s, joints: {left: {position: 0 rad}, knee: {position: 1 rad}}}\n"
     )
     motion = parse_motion(text, Path("m.yaml"), groups)
-
     assert list(motion.motion.motions[0].points[0].joints) == ["shoulder", "elbow", "knee"]
     where = motion.marks.key("motions", 0, "points", 0, "joints", "elbow")
     assert where == Mark("m.yaml", 5, 26)
@@ -100,7 +96,6 @@ controllers:"""
         "groups:\n", "groups:\n  hand: {bus: left, joints: [pitch, roll]}\n", 1
     )
     robot = desk.robot(text).robot
-
     assert robot.joints["pitch"].limits.velocity == 2.0
     assert not hasattr(robot.joints["pitch"], "bus")
 
@@ -110,7 +105,6 @@ def test_fragments_share_groups() -> None:
     robot = desk.robot(
         "include: [pair.yaml]\ngroups: {left: {joints: [elbow]}}\njoint_defaults: {model: XL430-W250}\njoints: {shoulder: {bus: right}}\n"
     ).robot
-
     assert robot.groups["left"].joints == ("elbow",)
     assert {joint.model for joint in robot.joints.values()} == {"XL430-W250"}
     assert robot.controllers["all_joints"].parameters == {"joints": ["knee", "elbow"]}
@@ -119,7 +113,6 @@ def test_fragments_share_groups() -> None:
 def test_wolfgangs_servos_have_their_registers() -> None:
     robot = read_robot(Path(__file__).parents[2] / "robots/wolfgang.yaml", {}).robot
     gains = {joint.registers["position_p_gain"] for joint in robot.joints.values()}
-
     assert {len(joint.registers) for joint in robot.joints.values()} == {12}
     assert (gains, robot.joints["RKnee"].registers["position_p_gain"]) == ({500, 800, 1200, 4000}, 4000)
     assert robot.joints["LKnee"].bus == "left_leg"

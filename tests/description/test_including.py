@@ -58,7 +58,6 @@ def test_the_including_file_wins_at_every_depth_but_replaces_lists(including: st
     assert (joint.id, joint.bus, joint.model) == (7, "main", "AX-12A")
     assert (joint.limits.position, joint.limits.velocity) == ((-1.0, 1.0), 1.0)
     assert description.robot.controllers["head"].parameters == {"joints": ["swing"]}
-
     main, fragment = str(Path.cwd() / "robot.yaml"), str(Path.cwd() / "fragments/head.yaml")
     assert marks.value("joints", "yaw", "id") == Mark(main, 12, 13)
     assert marks.value("joints", "yaw", "model") == Mark(fragment, 5, 35)
@@ -107,7 +106,6 @@ def test_fragments_include_relative_to_themselves_and_later_ones_win() -> None:
     )
     text = text.replace("recording: {directory: elsewhere}\n", "")
     description = desk.robot(text.replace("rate: 25", "rate: 5"))
-
     assert (description.robot.loop.rate, description.robot.loop.scheduler.priority) == (10, 5)
     assert description.robot.recording.directory == "c"
     assert [Path(name).name for name in description.included] == ["b.yaml", "a.yaml", "c.yaml"]
@@ -118,7 +116,6 @@ def test_a_fragment_that_two_files_include_counts_below_both() -> None:
     desk.write("include: [shared.yaml]\nrecording: {directory: left}\n", "left.yaml")
     desk.write("include: [shared.yaml]\n", "right.yaml")
     text = TORSO.replace("recording: {directory: elsewhere}", "include: [left.yaml, right.yaml]")
-
     assert desk.robot(text).robot.recording.directory == "left"
 
 
@@ -143,7 +140,6 @@ def test_depth_number_and_size_are_bounded() -> None:
         desk.write("{}", name)
     for name in ("large1.yaml", "large2.yaml"):
         desk.write("#" * 600_000 + "\n{}", name)
-
     for includes, expected in (
         (["deep0.yaml"], f"nested deeper than {MOST_LEVELS} files; include deep7.yaml in the robot file"),
         (names, f"more than {MOST_FILES} files are included; merge some of them"),
@@ -159,7 +155,6 @@ def test_depth_number_and_size_are_bounded() -> None:
 def test_fragments_that_cannot_be_read_are_named_at_the_include() -> None:
     desk.write("a: [1\n", "broken.yaml")
     (Path.cwd() / "folder.yaml").mkdir()
-
     assert desk.refusals(f"include: [gone.yaml, broken.yaml, folder.yaml]\n{TORSO}") == [
         "robot.yaml:1:11: file gone.yaml not found; "
         "check the name; it is relative to the folder of this file",
@@ -202,7 +197,6 @@ def leaves(value: object, path: KeyPath = ()) -> dict[KeyPath, object]:
 def test_merging_is_deep_and_each_value_keeps_the_mark_of_its_file(documents: list[dict[str, Any]]) -> None:
     grown = [grow(parse(json.dumps(each), str(n)), str(n), literal) for n, each in enumerate(documents)]
     result = merged(grown)
-
     assert result.data == functools.reduce(laid_over, documents)
     for path, value in leaves(result.data).items():
         file = int(result.marks.value(*path).file)

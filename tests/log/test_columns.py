@@ -422,7 +422,6 @@ def test_a_message_has_the_packets_of_a_bus_in_many_cycles(path: Path) -> None:
         batch.packet(0, PacketKind.NOISE, 9, 6, 6, b"idle")
     batch.commit_packets()
     log.close()
-
     written = [
         (one.topic, len(set(np.cumsum(one.message.cycle_delta).tolist())))
         for one in decode_log(path, in_order=False)

@@ -208,7 +208,6 @@ def test_the_torso_turns_with_its_imu_from_when_that_is_known() -> None:
     assert ("odom", "imu") not in transforms(scene.at({}))
     turned = Rotation.from_euler("xyz", [0.2, -0.3, 0.4])
     found = transforms(scene.at({}, tuple(2.0 * turned.as_quat())))
-
     assert found["odom", "imu"][:3, :3] == pytest.approx(turned.as_matrix(), abs=1e-12)
     assert ("odom", "imu") not in transforms(scene.still)
     everything = transforms(scene.still) | found

@@ -73,9 +73,7 @@ def test_included_and_motor_files_are_named_as_seen_from_the_robot_file(tmp_path
     )
     log = tmp_path / "run.mcap"
     simulated_robot(tmp_path / "robot/r.yaml", duration_s=0.1, log=log).run()
-
     record = read_log(log).metadata[IDENTITY_NAME]
-
     assert record["included ../parts.yaml"] == hash_of(part)
     assert "git revision" not in record
 
@@ -127,7 +125,6 @@ def test_another_byte_in_a_plug_in_is_another_hash(tmp_path: Path, monkeypatch: 
     before = code_hashes([("waves", "wave-robots")])
     (package / "wave.py").write_text("amplitude = 2\n")
     after = code_hashes([("waves", "wave-robots")])
-
     key = "plugin wave-robots waves/wave.py"
     assert [name for name in after if before[name] != after[name]] == [key]
     assert set(before) == {key, "plugin wave-robots waves/__init__.py", "runtime"}

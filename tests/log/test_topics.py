@@ -148,7 +148,6 @@ def test_inputs_come_back_as_they_were_and_another_reader_decodes_them(
     assert read.activation is not None
     assert read.activation.tobytes() == cycle(-1)
     assert read.cycles["cycle"].tolist() == [0, 1, 2, 3, 4]
-
     assert [one.message.cycle for one in decode_log(path, "/activation")] == [-1]
     planned, given, streamed, steering, *_ = (one.message for one in decode_log(path, "/commands"))
     assert (planned.cycle, planned.planned, planned.controller, list(planned.data)) == (3, 7, "left_arm", [])

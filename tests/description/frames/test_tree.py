@@ -83,7 +83,6 @@ def urdf() -> Urdf:
 
 def test_a_mimic_joint_follows_in_the_same_pose(urdf: Urdf) -> None:
     tree = FrameTree(urdf, SERVOS)
-
     assert tree.position("right", {"left": 0.04}) == pytest.approx(-0.058)
     assert tree.pose("right", "arm", {"left": 0.04}).translation == pytest.approx((0, -0.058, 0))
     by = {frame.name: frame.moved_by for frame in tree.frames}
@@ -96,7 +95,6 @@ def test_a_mimic_joint_of_a_joint_without_a_servo_rests(urdf: Urdf) -> None:
 
 def test_joints_that_are_not_given_rest_inside_their_limits(urdf: Urdf) -> None:
     tree = FrameTree(urdf, ())
-
     assert [tree.position(name, {}) for name in ("arm", "left", "shut")] == [0, pytest.approx(0.03), 1.0]
 
 
@@ -106,7 +104,6 @@ def test_one_frame_is_seen_from_any_other(urdf: Urdf) -> None:
     seen = tree.pose("wheel", "imu_link", positions) @ tree.pose("imu_link", "wheel", positions)
     direct = tree.pose("imu_link", "shut", positions)
     round_about = tree.pose("wheel", "shut", positions) @ tree.pose("imu_link", "wheel", positions)
-
     assert np.array(seen.matrix) == pytest.approx(np.eye(4), abs=1e-12)
     assert np.array(direct.matrix) == pytest.approx(np.array(round_about.matrix), abs=1e-12)
 
@@ -156,7 +153,6 @@ def test_an_imu_in_the_body_turns_the_whole_body(urdf: Urdf) -> None:
     measured = Rotation.from_euler("xyz", [0.3, -0.8, 2.0])
     orientation: Quaternion = tuple(measured.as_quat().tolist())
     positions = {"rail": 0.2, "arm": 1.3}
-
     assert [frame.name for frame in tree.frames[:2]] == ["odom", "base_link"]
     assert tree.frames[1].moved_by == "imu"
     found = tree.pose("imu_link", "odom", positions, orientation)
@@ -178,7 +174,6 @@ def test_what_hangs_from_the_imu_turns_with_it() -> None:
     orientation: Quaternion = tuple(measured.as_quat().tolist())
     odom = tree.pose("odom", "world", orientation=orientation)
     torso = tree.pose("torso_link", "odom", orientation=orientation)
-
     assert odom.translation == pytest.approx((0, 0, 0.3))
     turned = measured.as_matrix() @ rotation_of(tree.pose("torso_link", "odom"))
     assert rotation_of(torso) == pytest.approx(turned, abs=1e-12)
@@ -217,7 +212,6 @@ def test_roll_pitch_and_yaw_make_the_rotation_that_they_came_from(pitch: float) 
 
     made = Transform(rotation=from_rpy((0.4, pitch, -2.1)))
     again = Transform(rotation=from_rpy(made.rpy))
-
     assert rotation_of(again) == pytest.approx(rotation_of(made), abs=1e-9)
     expected = Rotation.from_euler("xyz", [0.4, pitch, -2.1]).as_matrix()
     assert rotation_of(made) == pytest.approx(expected, abs=1e-12)
