@@ -53,7 +53,7 @@ def started() -> Rig:
     return start_rig(make_plan((1, 2), model="XL430-W250", protocol=2.0))
 
 
-def test_part_gets_time_of_the_cycle_in_idle_time(calls: list[Any]) -> None:
+def test_part_gets_time_of_the_cycle_in_idle_time(calls):
     rig = started()
     for time_ns in (0, 20):
         rig.hardware.read_states()
@@ -62,7 +62,7 @@ def test_part_gets_time_of_the_cycle_in_idle_time(calls: list[Any]) -> None:
     assert calls == ["0 ns", "20 ns"]
 
 
-def test_part_recovers_servo_that_rebooted(calls: list[Any]) -> None:
+def test_part_recovers_servo_that_rebooted(calls):
     rig = started()
     rig.cycles(10)
     assert recovered(calls) == []
@@ -72,7 +72,7 @@ def test_part_recovers_servo_that_rebooted(calls: list[Any]) -> None:
     assert recovered(calls) == [1]
 
 
-def test_part_recovers_line_then_each_of_its_servos(calls: list[Any]) -> None:
+def test_part_recovers_line_then_each_of_its_servos(calls):
     rig = started()
     rig.buses[0].unplug()
     rig.cycles(3)
@@ -83,7 +83,7 @@ def test_part_recovers_line_then_each_of_its_servos(calls: list[Any]) -> None:
     assert sorted(recovered(calls)[1:]) == [0, 1]
 
 
-def test_safe_stage_gets_plan_of_its_feature(calls: list[Any]) -> None:
+def test_safe_stage_gets_plan_of_its_feature(calls):
     end = SafeEnd.import_stages((NOTED,), {"noted": b"left and right", "devices": b"others"})
     assert end.make_safe(started().hardware._lines) == ("1 lines, left and right",)
     assert SafeEnd.import_stages((NOTED,), {}).make_safe(started().hardware._lines) == ("1 lines, ",)
@@ -93,9 +93,7 @@ def test_safe_stage_gets_plan_of_its_feature(calls: list[Any]) -> None:
     ("name", "call", "raised"),
     [("failing", "plan[0]", "IndexError: index out of range"), ("exiting", "exit(3)", "SystemExit: 3")],
 )
-def test_feature_that_fails_at_the_end_leaves_the_others_safe(
-    name: str, call: str, raised: str, tmp_path: Path, calls: list[Any]
-) -> None:
+def test_feature_that_fails_at_the_end_leaves_the_others_safe(name, call, raised, tmp_path, calls):
     failing = tmp_path / f"{name}_feature"
     failing.mkdir()
     (failing / "__init__.py").touch()

@@ -78,9 +78,7 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callabl
 
 
 @pytest.mark.parametrize("as_text", [False, True])
-def test_a_table_is_taken_as_a_path_or_as_a_text(
-    install: Callable[[str], None], table: Path, as_text: bool
-) -> None:
+def test_a_table_is_taken_as_a_path_or_as_a_text(install, table, as_text):
     install(f"[{table.read_text()!r}]" if as_text else f"[Path({str(table)!r})]")
     assert load_plugins().broken == {}
     found = find_table("Mine-1", 1.0)
@@ -101,9 +99,7 @@ def test_a_table_is_taken_as_a_path_or_as_a_text(
         ("[TAKEN]", "is already used by the AX-12A"),
     ],
 )  # fmt: skip
-def test_a_servo_model_that_cannot_be_used_is_told_in_one_sentence(
-    install: Callable[[str], None], table: Path, offer: str, told: str
-) -> None:
+def test_a_servo_model_that_cannot_be_used_is_told_in_one_sentence(install, table, offer, told):
     taken = repr(table.read_text().replace("model_number = 60001", "model_number = 12"))
     install(offer.replace("TAKEN", taken))
     sentence = load_plugins().broken["my_servos"]
@@ -133,12 +129,8 @@ def dxlrun_here(tmp_path: Path) -> Callable[..., str]:
 
 @pytest.mark.parametrize("words", [[], ["--virtual"]], ids=["processes", "virtual"])
 def test_a_robot_of_foreign_servos_runs_in_simulation_and_its_model_is_listed(
-    install: Callable[[str], None],
-    table: Path,
-    tmp_path: Path,
-    dxlrun_here: Callable[..., str],
-    words: list[str],
-) -> None:
+    install, table, tmp_path, dxlrun_here, words
+):
     install(f"[Path({str(table)!r})]")
     (tmp_path / "robot.yaml").write_text(ROBOT)
     dxlrun_here("robot.yaml", "--duration", "0.2", "--no-record", "--no-gateway", *words)
@@ -157,9 +149,7 @@ items.heat = {address = 30, size = 1, tick = "1 degC", state = "temperature"}
 """
 
 
-def test_a_robot_with_a_device_of_a_plug_in_runs_in_simulation(
-    install: Callable[[str], None], tmp_path: Path, dxlrun_here: Callable[..., str]
-) -> None:
+def test_a_robot_with_a_device_of_a_plug_in_runs_in_simulation(install, tmp_path, dxlrun_here):
     install(f"[{BOARD!r}]")
     device = "devices: {oven: {bus: main, id: 7, model: theirs-1}}\n"
     (tmp_path / "robot.yaml").write_text(ROBOT.replace("Mine-1", "AX-12A") + device)

@@ -50,15 +50,13 @@ def extended(port: SerialPort, now: int, heard: int = 0) -> int:
     return port.extend_deadline(DEADLINE, SENT, heard, now)
 
 
-def test_request_that_was_not_taken_is_awaited(port: SimulatedPort, simulation: LineProgress) -> None:
+def test_request_that_was_not_taken_is_awaited(port, simulation):
     simulation.publish_received(SENT - 1)
     simulation.publish_served(ENDLESS_NS)
     assert extended(port, DEADLINE) == DEADLINE + MS
 
 
-def test_deadline_counts_from_when_the_request_was_taken(
-    port: SimulatedPort, simulation: LineProgress
-) -> None:
+def test_deadline_counts_from_when_the_request_was_taken(port, simulation):
     simulation.publish_served(SENT + 100 * MS)
     simulation.publish_received(SENT + 100 * MS)
     assert extended(port, SENT + 101 * MS) > SENT + 101 * MS
@@ -66,33 +64,27 @@ def test_deadline_counts_from_when_the_request_was_taken(
     assert extended(port, SENT + 102 * MS) <= SENT + 102 * MS
 
 
-def test_silent_servo_of_a_running_process_is_given_up_at_once(
-    port: SimulatedPort, simulation: LineProgress, stalls: StallCounter
-) -> None:
+def test_silent_servo_of_a_running_process_is_given_up_at_once(port, simulation, stalls):
     simulation.publish_served(ENDLESS_NS)
     simulation.publish_received(SENT + MS // 10)
     assert extended(port, DEADLINE) <= DEADLINE
     assert (stalls.times, stalls.waited_ns) == (0, 0)
 
 
-def test_reply_that_is_late_on_purpose_is_given_up_at_once(
-    port: SimulatedPort, simulation: LineProgress
-) -> None:
+def test_reply_that_is_late_on_purpose_is_given_up_at_once(port, simulation):
     """A latency timer of 16 ms: the process sleeps until the reply is due, which is behind the deadline."""
     simulation.publish_served(SENT + 16 * MS)
     simulation.publish_received(SENT)
     assert extended(port, DEADLINE) <= DEADLINE
 
 
-def test_reply_that_was_due_and_was_not_handed_over_is_awaited(
-    port: SimulatedPort, simulation: LineProgress
-) -> None:
+def test_reply_that_was_due_and_was_not_handed_over_is_awaited(port, simulation):
     simulation.publish_served(SENT + MS)  # when the reply is due; the process has not run since
     simulation.publish_received(SENT)
     assert extended(port, DEADLINE) > DEADLINE
 
 
-def test_bytes_that_the_kernel_still_has_are_awaited(port: SimulatedPort, simulation: LineProgress) -> None:
+def test_bytes_that_the_kernel_still_has_are_awaited(port, simulation):
     simulation.publish_received(SENT)
     simulation.publish_delivery(SENT + MS, SENT + 11 * MS)
     simulation.publish_served(ENDLESS_NS)
@@ -100,9 +92,7 @@ def test_bytes_that_the_kernel_still_has_are_awaited(port: SimulatedPort, simula
     assert extended(port, DEADLINE, heard=SENT + 11 * MS) <= DEADLINE
 
 
-def test_wait_is_bounded_and_not_repeated_for_the_same_stall(
-    port: SimulatedPort, simulation: LineProgress
-) -> None:
+def test_wait_is_bounded_and_not_repeated_for_the_same_stall(port, simulation):
     assert extended(port, SENT + LONGEST_STALL_NS - MS // 2) == SENT + LONGEST_STALL_NS
     late = SENT + LONGEST_STALL_NS
     assert extended(port, late) <= late
@@ -112,7 +102,7 @@ def test_wait_is_bounded_and_not_repeated_for_the_same_stall(
     assert port.extend_deadline(sent + 12 * MS, sent, 0, later) > later
 
 
-def test_waits_of_several_lines_count_once() -> None:
+def test_waits_of_several_lines_count_once():
     stalls = StallCounter()
     for begin in (100, 101, 102):
         for _line in range(3):
@@ -123,21 +113,19 @@ def test_waits_of_several_lines_count_once() -> None:
     assert (stalls.times, stalls.waited_ns) == (2, 7 * MS)
 
 
-def test_real_port_never_extends_a_deadline(port: SimulatedPort) -> None:
+def test_real_port_never_extends_a_deadline(port):
     real = SerialPort(port.descriptor, "/dev/ttyUSB0")
     assert extended(real, DEADLINE) == DEADLINE
     assert (real.late_ns(0, 9), real.stalled_ns(0, 9)) == (0, 0)
 
 
-def test_late_reply_is_split_into_what_its_process_was_late(
-    port: SimulatedPort, simulation: LineProgress
-) -> None:
+def test_late_reply_is_split_into_what_its_process_was_late(port, simulation):
     simulation.publish_received(SENT + 5 * MS)
     simulation.publish_delivery(SENT + 6 * MS, SENT + 9 * MS)
     assert port.late_ns(SENT, SENT + 10 * MS) == (5 + 4) * MS
 
 
-def test_stalls_count_as_far_as_they_overlap(memory: int, port: SimulatedPort) -> None:
+def test_stalls_count_as_far_as_they_overlap(memory, port):
     progress = SimulationProgress(memory)
     for second in range(20):  # more than are kept
         progress.note_stall(second * 1_000 * MS, (second * 1_000 + 100) * MS)
@@ -146,8 +134,6 @@ def test_stalls_count_as_far_as_they_overlap(memory: int, port: SimulatedPort) -
     assert port.stalled_ns(0, 2_000 * MS) == 0  # forgotten
 
 
-def test_port_of_a_line_that_is_back_keeps_its_progress(
-    port: SimulatedPort, simulation: LineProgress
-) -> None:
+def test_port_of_a_line_that_is_back_keeps_its_progress(port, simulation):
     simulation.publish_received(SENT - 1)
     assert extended(port.renewed(), DEADLINE) > DEADLINE

@@ -30,13 +30,13 @@ ROOT = Path(__file__).parents[2]
 ROBOT = ROOT / "robots" / "bioloid_torso.yaml"
 
 
-def test_each_feature_has_the_section_of_its_name() -> None:
+def test_each_feature_has_the_section_of_its_name():
     sections = {feature.name: section for feature, section in stages(Section, FEATURES)}
     assert {name: section.name for name, section in sections.items()} == {name: name for name in sections}
     assert robot_form().model_fields.keys() - Robot.model_fields.keys() == sections.keys()
 
 
-def test_all_files_of_features_are_on_the_page_of_the_architecture() -> None:
+def test_all_files_of_features_are_on_the_page_of_the_architecture():
     page = (ROOT / "docs" / "explanation" / "architecture.md").read_text()
     declared = re.compile(r'    FILE: ClassVar\[str\] = "(\w+)"')
     sources = [path.read_text() for path in (ROOT / "runtime" / "dxlrun").rglob("*.py")]
@@ -45,11 +45,11 @@ def test_all_files_of_features_are_on_the_page_of_the_architecture() -> None:
     assert {name for name in files if f"| `{name}.py` |" not in page} == set()
 
 
-def test_feature_without_file_takes_no_part_in_stage() -> None:
+def test_feature_without_file_takes_no_part_in_stage():
     assert Feature("empty", "dxlrun.messages").stage(CompileStage) is None
 
 
-def test_guardian_does_not_import_a_feature_of_one_module() -> None:
+def test_guardian_does_not_import_a_feature_of_one_module():
     code = (
         "import sys; from dxlrun.dynamixel.bus_part import SafeEnd; from dxlrun.features import FEATURES; "
         "SafeEnd.import_stages(FEATURES, {}); "
@@ -61,7 +61,7 @@ def test_guardian_does_not_import_a_feature_of_one_module() -> None:
     assert "dxlrun.features.lost_servos" not in imported
 
 
-def test_broken_file_of_feature_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_broken_file_of_feature_is_an_error(tmp_path, monkeypatch):
     package = tmp_path / "broken_feature"
     package.mkdir()
     (package / "__init__.py").touch()
@@ -75,7 +75,7 @@ def test_broken_file_of_feature_is_an_error(tmp_path: Path, monkeypatch: pytest.
         feature.stage(CompileStage)
 
 
-def test_forms_of_features_import_no_file_of_the_run() -> None:
+def test_forms_of_features_import_no_file_of_the_run():
     packages = [feature.package for feature, _ in stages(Section, FEATURES)]
     code = (
         "import importlib, sys\n"
@@ -89,9 +89,7 @@ def test_forms_of_features_import_no_file_of_the_run() -> None:
     assert done.stdout.splitlines() == packages
 
 
-def test_broken_section_of_plugin_leaves_robots_usable(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_broken_section_of_plugin_leaves_robots_usable(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(tmp_path))
     (tmp_path / "wrong_plugin.py").write_text(
         "from dxlrun.features.feature import Feature\n"
@@ -113,8 +111,8 @@ def test_broken_section_of_plugin_leaves_robots_usable(
     ],
 )
 def test_section_whose_form_cannot_be_built_refuses_only_files_with_it(
-    project: Callable[..., Path], robot_file: Callable[[str], Path], name: str, form: str, fault: str
-) -> None:
+    project, robot_file, name, form, fault
+):
     section = (
         "from dxlrun.tooling.features import Section\nfrom dxlrun.tooling.files import key\n\n"
         f"STAGE = Section({name!r}, {form}, key('Lights.', '{{}}', None))\n"
@@ -178,7 +176,7 @@ def offer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Offer:
         ("graph", "policy_key"),
     ],
 )
-def test_key_of_plugin_with_name_of_the_core_is_refused(offer: Offer, name: str, file: str) -> None:
+def test_key_of_plugin_with_name_of_the_core_is_refused(offer, name, file):
     _, installed, broken = offer(name, file)
     assert installed == FEATURES
     assert broken == {
@@ -187,22 +185,22 @@ def test_key_of_plugin_with_name_of_the_core_is_refused(offer: Offer, name: str,
     }
 
 
-def test_key_that_a_form_cannot_have_is_refused(offer: Offer) -> None:
+def test_key_that_a_form_cannot_have_is_refused(offer):
     assert "does not begin with a letter" in offer("_lamps", "joint_key")[2]["_lamps"]
 
 
-def test_key_that_is_not_the_name_of_its_feature_is_refused(offer: Offer) -> None:
+def test_key_that_is_not_the_name_of_its_feature_is_refused(offer):
     assert (
         "joint_key.py, servo_key.py or policy_key.py declares it"
         in (offer("lamps", "joint_key", declared="bus")[2]["lamps"])
     )
 
 
-def test_key_of_joints_and_of_servos_is_refused(offer: Offer) -> None:
+def test_key_of_joints_and_of_servos_is_refused(offer):
     assert "both for joints and for servos" in offer("glow", "joint_key", "servo_key")[2]["glow"]
 
 
-def test_key_before_an_unknown_one_is_the_last(offer: Offer) -> None:
+def test_key_before_an_unknown_one_is_the_last(offer):
     feature, installed, broken = offer("backlash", "joint_key")
     assert (installed, broken) == ((*FEATURES, feature), {})
     stage = feature.stage(JointKey)
@@ -210,7 +208,7 @@ def test_key_before_an_unknown_one_is_the_last(offer: Offer) -> None:
     assert [*with_keys(BareJoint, [stage]).model_fields] == [*BareJoint.model_fields, "backlash"]
 
 
-def test_all_names_of_the_core_are_reserved() -> None:
+def test_all_names_of_the_core_are_reserved():
     forms = {
         Section: (Robot,),
         JointKey: (Joint, SharedJoint, OneOfServos, Group),
@@ -227,7 +225,7 @@ def test_all_names_of_the_core_are_reserved() -> None:
     assert report["joints"][0].keys() <= {*RESERVED[JointKey].split()}
 
 
-def test_kinds_of_events_have_numbers_of_their_own() -> None:
+def test_kinds_of_events_have_numbers_of_their_own():
     kinds = [EventCode, *(stage.codes for _, stage in stages(EventStage, FEATURES))]
     numbers = [code.value for kind in kinds for code in kind]
     assert len(kinds) > 1

@@ -69,14 +69,14 @@ def problems(tmp_path: Path, text: str) -> str:
     return str(error.value)
 
 
-def test_value_is_in_the_plan_of_its_joint_only(tmp_path: Path) -> None:
+def test_value_is_in_the_plan_of_its_joint_only(tmp_path):
     plan = compiled(tmp_path, ROBOT).plan
     assert [dict(joint.keys) for joint in plan.loop.joints] == [{"backlash": np.radians(4)}, {}]
     assert from_json(to_json(plan)) == plan
     assert plan.packages["dxlrun_backlash"] == "dxlrun-backlash"
 
 
-def test_groups_and_defaults_give_the_key_to_joints(tmp_path: Path) -> None:
+def test_groups_and_defaults_give_the_key_to_joints(tmp_path):
     defaults = f"{ROBOT}joint_defaults: {{backlash: 1 deg}}\n"
     assert [joint.keys["backlash"] for joint in compiled(tmp_path, defaults).plan.loop.joints] == [
         pytest.approx(np.radians(4)),
@@ -90,33 +90,31 @@ def test_groups_and_defaults_give_the_key_to_joints(tmp_path: Path) -> None:
     assert plan.packages["dxlrun_backlash"] == "dxlrun-backlash"
 
 
-def test_joint_of_a_transmission_may_have_the_key(tmp_path: Path) -> None:
+def test_joint_of_a_transmission_may_have_the_key(tmp_path):
     joints = compiled(tmp_path, mechanics_with_backlash()).plan.loop.joints
     assert [joint.name for joint in joints if joint.keys] == ["wrist_roll"]
 
 
-def test_key_with_a_name_like_a_key_of_servos_makes_no_joint_with_a_servo(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_key_with_a_name_like_a_key_of_servos_makes_no_joint_with_a_servo(monkeypatch):
     assert kind_of_joint({"lead": "1 mm"}) == "<one servo>"  # means travel_per_turn
     lead = structs.replace(joint_forms.joint_keys()[0], name="lead")
     monkeypatch.setattr(joint_forms, "joint_keys", lambda: [lead])
     assert kind_of_joint({"lead": "1 mm"}) == "<no servo>"
 
 
-def test_layer_of_a_joint_key_is_above_the_servos_of_couplings(tmp_path: Path) -> None:
+def test_layer_of_a_joint_key_is_above_the_servos_of_couplings(tmp_path):
     plan = compiled(tmp_path, mechanics_with_backlash()).plan
     joints, servos = len(plan.loop.joints), len(plan.mechanics.servos)
     layers = HardwareLayers(plan, States.empty(joints), Commands.empty(joints), Events())
     assert [len(layer.goals.position) for layer in layers._layers] == [joints, servos]
 
 
-def test_check_of_the_feature_names_the_place(tmp_path: Path) -> None:
+def test_check_of_the_feature_names_the_place(tmp_path):
     found = problems(tmp_path, ROBOT.replace("4 deg", "400 deg"))
     assert found.endswith("robot.yaml:6:87: the backlash of knee is outside its range; write less")
 
 
-def test_unit_of_the_other_kind_of_joint_is_refused(tmp_path: Path) -> None:
+def test_unit_of_the_other_kind_of_joint_is_refused(tmp_path):
     slide = f"{ROBOT}  slide: {SLIDE % ', backlash: 1 deg'}\n"
     assert "slide is linear, so its backlash cannot be in rad; write it as 0.2 mm" in problems(
         tmp_path, slide
@@ -126,11 +124,11 @@ def test_unit_of_the_other_kind_of_joint_is_refused(tmp_path: Path) -> None:
     )
 
 
-def test_unknown_word_is_compared_with_the_key(tmp_path: Path) -> None:
+def test_unknown_word_is_compared_with_the_key(tmp_path):
     assert "did you mean backlash?" in problems(tmp_path, ROBOT.replace("backlash", "baklash"))
 
 
-def test_check_shows_the_key_as_a_column(tmp_path: Path) -> None:
+def test_check_shows_the_key_as_a_column(tmp_path):
     slide = f"{ROBOT}  slide: {SLIDE % ', backlash: 0.1 mm'}\n"
     found = compiled(tmp_path, slide)
     assert [row["backlash"] for row in found.report["joints"]] == [np.radians(4), None, 1e-4]
@@ -147,14 +145,8 @@ def test_check_shows_the_key_as_a_column(tmp_path: Path) -> None:
     ],
 )
 def test_check_shows_values_that_are_not_a_number(  # noqa: PLR0917  parameters
-    tmp_path: Path,
-    project: Callable[..., Path],
-    capsys: pytest.CaptureFixture[str],
-    name: str,
-    form: str,
-    example: str,
-    written: str,
-) -> None:
+    tmp_path, project, capsys, name, form, example, written
+):
     stage = (
         "from typing import Annotated, Literal\n\nfrom pydantic import Field\n\n"
         "from dxlrun import LINEAR, ROTARY\nfrom dxlrun.tooling.features import JointKey\n"
@@ -169,17 +161,17 @@ def test_check_shows_values_that_are_not_a_number(  # noqa: PLR0917  parameters
     assert written in capsys.readouterr().out
 
 
-def test_no_column_while_no_joint_has_the_key(tmp_path: Path) -> None:
+def test_no_column_while_no_joint_has_the_key(tmp_path):
     table = next(iter(check._tables(compiled(tmp_path, ROBOT.replace(", backlash: 4 deg", "")))))
     assert "backlash" not in [one.name for one in table.columns]
 
 
-def test_clients_of_a_run_get_the_key(tmp_path: Path) -> None:
+def test_clients_of_a_run_get_the_key(tmp_path):
     values = JointValues.from_joints(compiled(tmp_path, ROBOT).plan.loop.joints, {})
     assert values.joint_keys == {"backlash": {"knee": np.radians(4)}}
 
 
-def test_key_is_in_the_schema() -> None:
+def test_key_is_in_the_schema():
     schema = robot_schema({}, {})
     names = [*schema["$defs"]["Joint"]["properties"]]
     assert names[names.index("simulation") - 1] == "backlash"
@@ -187,7 +179,7 @@ def test_key_is_in_the_schema() -> None:
     assert "Play of the gear" in schema["$defs"]["BareJoint"]["properties"]["backlash"]["description"]
 
 
-def test_goals_go_on_by_half_of_the_play(tmp_path: Path) -> None:
+def test_goals_go_on_by_half_of_the_play(tmp_path):
     text = f"{ROBOT}controllers:\n  legs: {{type: joint_group_position_controller, joints: [knee, ankle]}}\n"
     (tmp_path / "robot.yaml").write_text(text)
     motion = tmp_path / "motion.yaml"

@@ -79,19 +79,19 @@ def run(path: Path, policies: str) -> Ended:
     return Ended(result.reason, result.detail, torque, events, read)
 
 
-def test_hot_servo_becomes_limp(tmp_path: Path) -> None:
+def test_hot_servo_becomes_limp(tmp_path):
     ended = run(tmp_path, HOT % "limp")
     assert (ended.reason, ended.torque) == ("ended", [False, True])
     assert ended.events == [("pan", "is hot; on_hot_servo: limp")]
 
 
-def test_hot_servo_ends_the_run_which_says_why(tmp_path: Path) -> None:
+def test_hot_servo_ends_the_run_which_says_why(tmp_path):
     ended = run(tmp_path, HOT % "stop")
     assert (ended.reason, ended.detail) == ("fault", "pan is hot; on_fault: limp")
     assert 25 <= len(ended.log.cycles) <= 40
 
 
-def test_controllers_of_hot_servo_are_held_until_it_is_cool(tmp_path: Path) -> None:
+def test_controllers_of_hot_servo_are_held_until_it_is_cool(tmp_path):
     ended = run(tmp_path, HOT % "hold")
     assert (ended.reason, ended.torque) == ("ended", [True, True])
     assert [event for event in ended.events if event[0] == "head"] == [
@@ -100,7 +100,7 @@ def test_controllers_of_hot_servo_are_held_until_it_is_cool(tmp_path: Path) -> N
     ]
 
 
-def test_group_has_its_own_policy(tmp_path: Path) -> None:
+def test_group_has_its_own_policy(tmp_path):
     groups = "policies: {groups: {neck: {joints: [%s], on_hot_servo: {above: 60 degC, do: limp}}}}\n"
     assert run(tmp_path, groups % "pan").torque == [False, True]
     assert run(tmp_path, groups % "tilt").torque == [True, True]
@@ -108,14 +108,14 @@ def test_group_has_its_own_policy(tmp_path: Path) -> None:
     assert run(tmp_path, both % "tilt").events == [("pan", "is hot; on_hot_servo: continue")]
 
 
-def test_run_ends_by_the_steps_of_the_policy(tmp_path: Path) -> None:
+def test_run_ends_by_the_steps_of_the_policy(tmp_path):
     ended = run(tmp_path, OVERHEAT)
     assert (ended.reason, ended.torque) == ("fault", [True, True])
     assert ended.detail == "a servo is above 72 degC; on_overheat: pose rest at 60 deg/s, then limp"
     assert ended.log.cycles["position"][-1][1] == pytest.approx(math.radians(20), abs=0.05)
 
 
-def test_steps_of_the_policy_are_checked(tmp_path: Path) -> None:
+def test_steps_of_the_policy_are_checked(tmp_path):
     file = tmp_path / "pair.yaml"
     file.write_text(ROBOT + OVERHEAT)
     rows = {row.name: row for row in compile_files(file, {}, []).report["policies"]}
@@ -129,7 +129,7 @@ def test_steps_of_the_policy_are_checked(tmp_path: Path) -> None:
         plan_of(file)
 
 
-def test_check_shows_the_policy(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_shows_the_policy(tmp_path, capsys):
     file = tmp_path / "pair.yaml"
     file.write_text(ROBOT + HOT % "hold")
     rows = {row.name: row.does for row in compile_files(file, {}, []).report["policies"]}
@@ -151,7 +151,7 @@ def test_check_shows_the_policy(tmp_path: Path, capsys: pytest.CaptureFixture[st
         ("policies: {groups: {a: {joints: [pan], on_hot_servo: {above: 70 degC, do: melt}}}}", "melt"),
     ],
 )
-def test_mistake_is_named_at_its_place(tmp_path: Path, policies: str, message: str) -> None:
+def test_mistake_is_named_at_its_place(tmp_path, policies, message):
     file = tmp_path / "pair.yaml"
     file.write_text(f"{ROBOT}{policies}\n")
     with pytest.raises(InputError) as error:
@@ -161,7 +161,7 @@ def test_mistake_is_named_at_its_place(tmp_path: Path, policies: str, message: s
     assert problem.mark.line == len(ROBOT.splitlines()) + 1
 
 
-def test_robot_without_the_key_does_not_use_the_package(tmp_path: Path) -> None:
+def test_robot_without_the_key_does_not_use_the_package(tmp_path):
     file = tmp_path / "pair.yaml"
     file.write_text(ROBOT + "policies: {exit_timeout: 3 s}\n")
     plan = plan_of(file)
@@ -175,14 +175,14 @@ def test_robot_without_the_key_does_not_use_the_package(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("policies", [HOT % "limp", HOT % "hold", HOT % "stop", OVERHEAT])
-def test_replay_decides_like_the_run(tmp_path: Path, policies: str) -> None:
+def test_replay_decides_like_the_run(tmp_path, policies):
     ended = run(tmp_path, policies)
     report = replay_log(tmp_path / "run.mcap")
     assert (report.compared, report.different, report.fault) == (len(ended.log.cycles), 0, "")
     assert not any("not installed" in remark for remark in report.remarks)
 
 
-def test_replay_without_the_package_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_replay_without_the_package_says_so(tmp_path, monkeypatch):
     run(tmp_path, HOT % "limp")
     features = from_json(read_log(tmp_path / "run.mcap").attachments["plan.json"]).features
     assert features[-1].distribution == "dxlrun-hot 1.0"

@@ -82,27 +82,27 @@ def compiled(tmp_path: Path, text: str) -> CompiledRobot:
     return compile_files(tmp_path / "robot.yaml", {}, [])
 
 
-def test_each_servo_has_the_value_of_its_own_or_of_its_joint(tmp_path: Path) -> None:
+def test_each_servo_has_the_value_of_its_own_or_of_its_joint(tmp_path):
     plan = compiled(tmp_path, ROBOT).plan
     assert {servo.servo_id for servo in plan.buses[0].servos if "led" in servo.declared} == GLOWING
     assert plan.buses[0].servos[0].declared == {"position_p_gain": 700, "led": 1}
     assert plan.packages["dxlrun_glow"] == "dxlrun-glow"
 
 
-def test_key_of_a_later_feature_counts(tmp_path: Path) -> None:
+def test_key_of_a_later_feature_counts(tmp_path):
     text = ROBOT.replace("registers: {position_p_gain: 700}", "registers: {led: 0}")
     settings = compiled(tmp_path, text).plan.buses[0].servos[0].settings
     assert [(one.name, one.value) for one in settings] == [("led", 1)]
 
 
-def test_robot_without_the_key_does_not_use_the_package(tmp_path: Path) -> None:
+def test_robot_without_the_key_does_not_use_the_package(tmp_path):
     sys.modules.pop("dxlrun_glow.settings", None)
     feature._stage.cache_clear()
     assert "dxlrun_glow" not in compiled(tmp_path, re.sub(", glow: (true|false)", "", ROBOT)).plan.packages
     assert "dxlrun_glow.settings" not in sys.modules
 
 
-def test_mistake_has_the_place_of_the_key(tmp_path: Path) -> None:
+def test_mistake_has_the_place_of_the_key(tmp_path):
     text = ROBOT.replace("id: 4, glow: false", "id: 4, glow: maybe")
     with pytest.raises(
         InputError, match=r"robot.yaml:10:42: joints.both.servos\[1\].glow is the text 'maybe'"
@@ -110,24 +110,24 @@ def test_mistake_has_the_place_of_the_key(tmp_path: Path) -> None:
         compiled(tmp_path, text)
 
 
-def test_setting_that_the_model_does_not_have_is_refused(tmp_path: Path) -> None:
+def test_setting_that_the_model_does_not_have_is_refused(tmp_path):
     text = ROBOT.replace("id: 2}", "id: 2, model: PH42-020-S300-R, glow: true}")
     with pytest.raises(InputError, match="cannot glow"):
         compiled(tmp_path, text)
 
 
-def test_joint_of_a_transmission_does_not_have_the_key(tmp_path: Path) -> None:
+def test_joint_of_a_transmission_does_not_have_the_key(tmp_path):
     with pytest.raises(InputError, match="roll"):
         compiled(tmp_path, ROBOT.replace("roll: {}", "roll: {glow: true}"))
 
 
-def test_every_form_of_a_servo_is_in_the_schema() -> None:
+def test_every_form_of_a_servo_is_in_the_schema():
     forms = robot_schema({}, {})["$defs"]
     having = {name for name, form in forms.items() if "glow" in form.get("properties", {})}
     assert having == {"Joint", "SharedJoint", "OneOfServos", "TransmissionServo", "Group"}
 
 
-def test_start_and_return_write_the_setting(tmp_path: Path) -> None:
+def test_start_and_return_write_the_setting(tmp_path):
     (tmp_path / "robot.yaml").write_text(ROBOT)
     robot = simulated_robot(tmp_path / "robot.yaml", duration_s=3.0)
     servos, leds = robot.buses[0].servos, list[set[int]]()

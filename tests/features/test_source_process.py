@@ -15,14 +15,14 @@ from dxlrun.testing import plan_of
 ROBOT = Path(__file__).parents[2] / "robots/bioloid_torso_imu.yaml"
 
 
-def test_plan_has_a_process_for_each_sensor() -> None:
+def test_plan_has_a_process_for_each_sensor():
     plan = plan_of(ROBOT, arguments={"port": "sim"})
     (planned,) = planned_processes(plan.loop)
     assert (planned.feature.name, planned.index, planned.process.kind) == ("sensors", 0, "sensor")
     assert planned.process.values == len(plan.loop.source_states[planned.process.source])
 
 
-def test_sensors_and_policies_of_a_log_of_an_earlier_version_are_those_of_features() -> None:
+def test_sensors_and_policies_of_a_log_of_an_earlier_version_are_those_of_features():
     plan = plan_of(ROBOT, arguments={"port": "sim"})
     tree = json.loads(to_json(plan))
     loop = tree["loop"]

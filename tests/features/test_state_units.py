@@ -58,7 +58,7 @@ def robot(tmp_path: Path) -> Path:
     return path
 
 
-def test_unit_of_a_device_table_is_in_list_log_and_report(robot: Path, tmp_path: Path) -> None:
+def test_unit_of_a_device_table_is_in_list_log_and_report(robot, tmp_path):
     log = tmp_path / "run.mcap"
     run = simulated_robot(robot, duration_s=0.2, log=log)
     run.run()
@@ -78,14 +78,14 @@ def test_unit_of_a_device_table_is_in_list_log_and_report(robot: Path, tmp_path:
     assert [row[-1] for row in shown[1:]] == ["21.5 deg C", "0"]
 
 
-def test_check_shows_units_of_a_device(robot: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_shows_units_of_a_device(robot, capsys):
     assert main(["check", str(robot), "--json"]) == 0
     (row,) = json.loads(capsys.readouterr().out)["result"]["devices"]
     assert row["states"] == ["illuminance", "temperature", "door"]
     assert (row["units"], row["command_units"]) == (UNITS, {"fan": "rad/s"})
 
 
-def test_unknown_unit_of_a_table_is_refused(robot: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_unknown_unit_of_a_table_is_refused(robot, capsys):
     (robot.parent / "board.toml").write_text(BOARD.replace('units = ["lx"]', ""))
     assert main(["check", str(robot)]) == 2
     assert "light: tick: '0.5 lx': the unit is not one of rad, deg" in " ".join(
@@ -93,7 +93,7 @@ def test_unknown_unit_of_a_table_is_refused(robot: Path, capsys: pytest.CaptureF
     )
 
 
-def test_sensor_has_the_units_of_known_quantities_unless_it_names_its_own() -> None:
+def test_sensor_has_the_units_of_known_quantities_unless_it_names_its_own():
     class Gyroscope(Sensor[Any]):
         @classmethod
         def states(cls, parameters: Any) -> tuple[str, ...]:
@@ -109,11 +109,11 @@ def test_sensor_has_the_units_of_known_quantities_unless_it_names_its_own() -> N
     ("found", "fits"),
     [({"a": "lx"}, True), ({}, True), ({"c": "lx"}, False), ({"a": 1}, False), (("lx",), False)],
 )
-def test_units_of_a_sensor_are_texts_of_its_states(found: object, fits: bool) -> None:
+def test_units_of_a_sensor_are_texts_of_its_states(found, fits):
     assert is_units(found, ("a", "b")) is fits
 
 
-def test_values_and_names_are_written_with_their_units() -> None:
+def test_values_and_names_are_written_with_their_units():
     assert quantity_text(0.1234567, "rad/s") == "0.123457 rad/s"
     assert quantity_text(21.5, "degC", digits=2) == "22 deg C"
     assert (quantity_text(0.5, "1"), quantity_text(3.0), quantity_text(None, "V")) == ("0.5", "3", "-")

@@ -95,14 +95,14 @@ def _moved(tmp_path: Path, log: Path | None = None) -> tuple[float, float]:
     return float(robot.record.goals.position[0]), float(robot.record.states.position[0])
 
 
-def test_layer_changes_what_servos_get_and_no_record(with_offset: None, tmp_path: Path) -> None:
+def test_layer_changes_what_servos_get_and_no_record(with_offset, tmp_path):
     goal, position = _moved(tmp_path, tmp_path / "run.mcap")
     assert goal == pytest.approx(0.5, abs=1e-6)
     assert position == pytest.approx(0.5 + OFFSET, abs=0.01)
     replayed(tmp_path / "run.mcap")
 
 
-def test_layer_above_the_mechanics_has_rows_of_joints(with_offset: None, plan: Callable[..., Plan]) -> None:
+def test_layer_above_the_mechanics_has_rows_of_joints(with_offset, plan):
     coupled = plan()
     states, goals = States.empty(5), Commands.empty(5)
     layers = HardwareLayers(coupled, states, goals, lambda *_: None)
@@ -114,7 +114,7 @@ def test_layer_above_the_mechanics_has_rows_of_joints(with_offset: None, plan: C
     assert isinstance(built._hardware, JointHardware)
 
 
-def test_robot_without_layers_has_the_arrays_of_the_record(tmp_path: Path) -> None:
+def test_robot_without_layers_has_the_arrays_of_the_record(tmp_path):
     path = tmp_path / "pair.yaml"
     path.write_text(ROBOT)
     robot = simulated_robot(path, duration_s=0.1)

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import pytest
 
 from dxlrun.compile.simulation import simulation_of
-from dxlrun.plan.robot_plan import Plan
 
 
-def test_every_servo_is_in_one_mechanism_and_every_joint_too(plan: Callable[..., Plan]) -> None:
+def test_every_servo_is_in_one_mechanism_and_every_joint_too(plan):
     compiled = plan()
     names = [joint.name for joint in compiled.loop.joints]
     found = compiled.mechanics.mechanisms(len(names))
@@ -22,7 +20,7 @@ def test_every_servo_is_in_one_mechanism_and_every_joint_too(plan: Callable[...,
     assert {one.name for one in found if not one.own} == {"hip", "wrist"}
 
 
-def test_the_simulation_has_the_mechanisms_of_the_plan(plan: Callable[..., Plan]) -> None:
+def test_the_simulation_has_the_mechanisms_of_the_plan(plan):
     simulated = simulation_of(plan()).mechanisms
     assert [(one.joints, len(one.servos), one.is_single) for one in simulated] == [
         (("head",), 1, True),
@@ -32,7 +30,7 @@ def test_the_simulation_has_the_mechanisms_of_the_plan(plan: Callable[..., Plan]
     ]
 
 
-def test_servo_of_a_transmission_reaches_all_corners_of_its_joints(plan: Callable[..., Plan]) -> None:
+def test_servo_of_a_transmission_reaches_all_corners_of_its_joints(plan):
     (bus,) = plan().buses
     left, right = (servo for servo in bus.servos if servo.joint.startswith("wrist"))
     for servo in (left, right):

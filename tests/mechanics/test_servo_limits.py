@@ -42,9 +42,7 @@ def run(
     return [event.text for event in log.events if event.code == EventCode.GATE], goals
 
 
-def test_two_servos_of_a_joint_give_what_the_weaker_one_may(
-    plan: Callable[..., Plan], tmp_path: Path
-) -> None:
+def test_two_servos_of_a_joint_give_what_the_weaker_one_may(plan, tmp_path):
     effort = "{type: joint_group_effort_controller, joints: [hip]}"
     texts, goals = run(plan, tmp_path, effort, ("efforts", 0.3), current_limit=20)
     assert max(map(abs, goals[2])) == max(map(abs, goals[3])) == 20
@@ -53,9 +51,7 @@ def test_two_servos_of_a_joint_give_what_the_weaker_one_may(
 
 
 @pytest.mark.parametrize(("speed", "held"), [(80.0, True), (60.0, False)])
-def test_a_joint_of_a_differential_is_as_fast_as_the_slower_servo_may(
-    plan: Callable[..., Plan], tmp_path: Path, speed: float, held: bool
-) -> None:
+def test_a_joint_of_a_differential_is_as_fast_as_the_slower_servo_may(plan, tmp_path, speed, held):
     velocity = "{type: joint_group_velocity_controller, joints: [pitch, roll]}"
     command = ("velocities", math.radians(speed), 0.0)
     texts, goals = run(plan, tmp_path, velocity, command, velocity_limit=50)
