@@ -4,13 +4,13 @@ from functools import partial
 
 import pytest
 from tests.kit.line_faults import delay_next
+from tests.kit.plans import distinct_tables
 from tests.kit.servo_cases import CASES, read_cases
 from tests.kit.tool_cases import RATE, WRITE, ToolCase, ToolRig
 
 from dxlrun.dynamixel.tools import servo_backup
 from dxlrun.errors import ServoFault
 from dxlsim.simulation_plan import ServoConfig
-from dxlwire.control_table import all_tables
 
 ALL = [case for path in CASES.with_name("tool_cases").glob("*.txt") for case in read_cases(path, ToolCase)]
 MODELS = pytest.mark.parametrize("model", ["AX-12A", "MX-64", "XM430-W350", "XL-320"])
@@ -62,14 +62,10 @@ def test_a_servo_gets_every_rate_of_its_table_another_id_and_torque_where_it_sta
 
 @pytest.mark.parametrize("protocol", [1.0, 2.0])
 def test_the_backup_of_every_model_fits_that_model_and_heals_it(tmp_path, protocol):
-    tables = [table for table in all_tables() if table.protocol == protocol and not table.firmware]
-    layouts = {
-        tuple((item.name, item.address) for item in table.items.values()): table
-        for table in tables
-        if RATE in table.baud_rates.values()
-    }
-    assert layouts
-    for table in layouts.values():
+    tables = [table for table in distinct_tables() if table.protocol == protocol and not table.firmware]
+    found = [table for table in tables if RATE in table.baud_rates.values()]
+    assert found
+    for table in found:
         rig = ToolRig(table.model, protocol=protocol)
         names = [name for name in table.items if not name.startswith("indirect_")]
         assert list(rig.one.read_items(names, refused=True)) == names, "all of it can be read"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from tests.kit.plans import distinct_tables
 from tests.kit.rigs import Rig, VirtualLine, make_plan, make_rig
 
 from dxlrun.channels.event_records import EventCode, Severity
@@ -10,7 +11,7 @@ from dxlrun.dynamixel.servo.registers import meaning
 from dxlrun.dynamixel.tools.scanning import Search, scan
 from dxlrun.dynamixel.tools.tool_line import ToolLine
 from dxlsim.simulation_plan import ServoConfig
-from dxlwire.control_table import ControlTable, all_tables, find_table, read_control_table, table_files
+from dxlwire.control_table import ControlTable, find_table, read_control_table, table_files
 
 X = {
     0x01: "input voltage",
@@ -50,7 +51,7 @@ FAULTS = {
     4: (lambda servo: servo.set_voltage(90.0), {"input voltage error", "over voltage error"}),
 }
 """Faults that the simulation can set, by the servo: how to set one, and the names that are right for it"""
-TABLES = all_tables()
+TABLES = distinct_tables()
 every_table = pytest.mark.parametrize("table", TABLES, ids=lambda table: f"{table.model} {table.protocol}")
 reporting = pytest.mark.parametrize(
     "table",

@@ -11,51 +11,59 @@ from dxlrun.errors import PortError
 from dxlsim.simulation_plan import AdapterConfig, ServoConfig
 from dxlwire.control_table import all_tables
 
-
-def two(servo_id, model="XM430-W350", **more):
-    return ServoConfig(servo_id, model, 2.0, **more)
+BOTH = pytest.mark.parametrize(("model", "protocol"), [("AX-12A", 1.0), ("XM430-W350", 2.0)])
 
 
-def names(scanned):
-    return [(one.protocol, one.baud_rate, one.servo_id, one.model) for one in scanned.servos]
+def two(servo_id, model="XM430-W350"):
+    return ServoConfig(servo_id, model, 2.0)
+
+
+def line_of(*servos, rate=57_600, **more):
+    """Return a line with servos of one protocol, which their models decide."""
+    protocol = 1.0 if servos and servos[0].model[:2] in {"AX", "MX"} else 2.0
+    return VirtualLine(*servos, protocol=protocol, rate=rate, **more)
+
+
+def scanned(line, *ids, protocols=(2.0,), rates=(57_600,)):
+    return scan(ToolLine(line), Search(protocols, rates, ids))
+
+
+def names(found):
+    return [(one.protocol, one.baud_rate, one.servo_id, one.model) for one in found.servos]
 
 
 def test_one_broadcast_ping_finds_all_servos_of_protocol_2():
-    line = VirtualLine(two(1), two(7, "XL430-W250"), two(252, "XL-320"))
-    found = scan(ToolLine(line), Search((2.0,), (57_600,)))
-    assert names(found) == [
-        (2.0, 57_600, 1, "XM430-W350"),
-        (2.0, 57_600, 7, "XL430-W250"),
-        (2.0, 57_600, 252, "XL-320"),
-    ]
+    line = line_of(two(1), two(7, "XL430-W250"), two(252, "XL-320"))
+    found = scanned(line)
+    models = {1: "XM430-W350", 7: "XL430-W250", 252: "XL-320"}
+    assert names(found) == [(2.0, 57_600, servo_id, model) for servo_id, model in models.items()]
     assert [one.remarks for one in found.servos] == [(), (), ()]
     assert sum(data[4] == 0xFE for data in line.heard) == 1
     assert {data[7] for data in line.heard} == {1, 2}  # pings and reads: nothing is written
 
 
-@pytest.mark.parametrize(("protocol", "rate"), [(1.0, 1_000_000), (2.0, 1_000_000)])
-def test_every_model_is_known_by_its_number_and_can_be_drafted_from(protocol, rate):
+@pytest.mark.parametrize("protocol", [1.0, 2.0])
+def test_every_model_is_known_by_its_number_and_can_be_drafted_from(protocol):
     tables = [table for table in all_tables() if table.protocol == protocol]
-    servos = [ServoConfig(number + 1, table.model, 0.5) for number, table in enumerate(tables)]
-    found = scan(ToolLine(VirtualLine(*servos, protocol=protocol, rate=rate)), Search((protocol,), (rate,)))
-    assert [one.model for one in found.servos] == [table.model for table in tables]
-    assert {one.return_delay for one in found.servos} == {500_000}
-    assert all(one.position is not None and one.lowest is not None for one in found.servos)
-    assert [one.remarks for one in found.servos] == [()] * len(tables)
+    servos = [ServoConfig(number, table.model, 0.5) for number, table in enumerate(tables, 1)]
+    line = VirtualLine(*servos, protocol=protocol, rate=1_000_000)
+    found = scanned(line, protocols=(protocol,), rates=(1_000_000,)).servos
+    assert [one.model for one in found] == [table.model for table in tables]
+    assert {one.return_delay for one in found} == {500_000}
+    assert all(one.position is not None and one.lowest is not None for one in found)
+    assert {one.remarks for one in found} == {()}
 
 
 def test_a_servo_at_another_rate_is_found_at_its_own():
-    line = VirtualLine(two(3))
+    line = line_of(two(3))
     line.bus.servo(3).poke("baud_rate", 3)  # 1 Mbit/s
-    found = scan(ToolLine(line), Search((2.0,), ()))
-    assert names(found) == [(2.0, 1_000_000, 3, "XM430-W350")]
+    assert names(scanned(line, rates=())) == [(2.0, 1_000_000, 3, "XM430-W350")]
 
 
-@pytest.mark.parametrize("protocol", [1.0, 2.0])
-def test_a_servo_that_answers_late_is_found_and_not_taken_for_two(protocol):
+@BOTH
+def test_a_servo_that_answers_late_is_found_and_not_taken_for_two(model, protocol):
     """A machine that stands still for 90 ms, at the first ping and in the middle of looking closer."""
-    model = "AX-12A" if protocol == 1.0 else "XM430-W350"
-    line = VirtualLine(two(3, model), protocol=protocol, rate=1_000_000)
+    line = line_of(two(3, model), rate=1_000_000)
     for late_ns in (90_000_000, 0, 90_000_000, 0, 90_000_000):
         delay_next(line.bus, 3, late_ns)
     search = Search((protocol,), (1_000_000,), (1, 2, 3, 4))
@@ -66,51 +74,37 @@ def test_a_servo_that_answers_late_is_found_and_not_taken_for_two(protocol):
     assert (found.model, found.remarks) == (model, ())
 
 
-def test_protocol_1_is_asked_id_by_id():
-    line = VirtualLine(two(1, "AX-12A"), two(253, "MX-64"), protocol=1.0, rate=1_000_000)
-    found = scan(ToolLine(line), Search((1.0,), (1_000_000,)))
+def test_protocol_1_is_asked_id_by_id_and_a_late_answer_is_noticed_and_asked_again():
+    line = line_of(two(1, "AX-12A"), two(253, "MX-64"), rate=1_000_000)
+    delay_next(line.bus, 1, 3_000_000)  # it comes while the next ID is asked
+    found = scanned(line, protocols=(1.0,), rates=(1_000_000,))
     assert names(found) == [(1.0, 1_000_000, 1, "AX-12A"), (1.0, 1_000_000, 253, "MX-64")]
     assert (found.servos[0].lowest, found.servos[0].highest) == (0, 1023)
-    assert found.servos[0].return_delay == 500_000
     assert {data[4] for data in line.heard} == {1, 2}
 
 
-def test_a_late_answer_is_noticed_and_asked_again():
-    line = VirtualLine(two(5, "AX-12A"), protocol=1.0, rate=1_000_000)
-    delay_next(line.bus, 5, 3_000_000)  # it comes while the next ID is asked
-    found = scan(ToolLine(line), Search((1.0,), (1_000_000,)))
-    assert names(found) == [(1.0, 1_000_000, 5, "AX-12A")]
-
-
-@pytest.mark.parametrize(("model", "protocol"), [("AX-12A", 1.0), ("XM430-W350", 2.0)])
+@BOTH
 @pytest.mark.parametrize("ids", [(), (1, 2, 3, 4)])
 def test_an_adapter_that_keeps_replies_back_for_longer_than_is_known_makes_no_twins(model, protocol, ids):
     adapter = AdapterConfig(latency_timer_ns=16_000_000)
-    line = VirtualLine(two(1, model), two(3, model), protocol=protocol, rate=1_000_000, adapter=adapter)
-    found = scan(ToolLine(line), Search((protocol,), (1_000_000,), ids))
-    assert [(one.servo_id, one.model, one.remarks) for one in found.servos] == [
-        (1, model, ()),
-        (3, model, ()),
-    ]
+    line = line_of(two(1, model), two(3, model), rate=1_000_000, adapter=adapter)
+    found = scanned(line, *ids, protocols=(protocol,), rates=(1_000_000,)).servos
+    assert [(one.servo_id, one.model, one.remarks) for one in found] == [(1, model, ()), (3, model, ())]
 
 
-def test_two_servos_of_one_id_are_named():
-    line = VirtualLine(two(2), ServoConfig(2, "XM430-W350", 1.0))
-    (found,) = scan(ToolLine(line), Search((2.0,), (57_600,))).servos
-    assert "do two servos have this ID?" in found.remarks[0]
-
-
-def test_two_servos_of_different_models_and_one_id_do_not_hide_each_other():
-    line = VirtualLine(two(2), two(2, "XL430-W250"), two(3))
-    found = scan(ToolLine(line), Search((2.0,), (57_600,)))
-    assert [one.servo_id for one in found.servos] == [2, 3]
-    assert "garbled" in found.servos[0].remarks[0]
+@pytest.mark.parametrize(
+    ("other", "said"), [("XM430-W350", "do two servos have this ID?"), ("XL430-W250", "garbled")]
+)
+def test_two_servos_of_one_id_are_named_and_hide_no_other(other, said):
+    found = scanned(line_of(two(2), ServoConfig(2, other, 1.0), two(3))).servos
+    assert [one.servo_id for one in found] == [2, 3]
+    assert said in found[0].remarks[0]
 
 
 def test_a_servo_that_answers_no_reads_is_listed_with_the_reason():
-    line = VirtualLine(two(4, "AX-12A"), protocol=1.0, rate=1_000_000)
+    line = line_of(two(4, "AX-12A"), rate=1_000_000)
     line.bus.servo(4).poke("status_return_level", 0)
-    (found,) = scan(ToolLine(line), Search((1.0,), (1_000_000,), (4,))).servos
+    (found,) = scanned(line, 4, protocols=(1.0,), rates=(1_000_000,)).servos
     assert (found.model, found.model_number) == ("", -1)
     assert found.remarks == (
         "answered a ping, but did not answer 3 reads of its model number: check its cable and power, and its "
@@ -119,16 +113,15 @@ def test_a_servo_that_answers_no_reads_is_listed_with_the_reason():
 
 
 def test_an_unknown_model_is_listed_with_its_number():
-    line = VirtualLine(two(4))
+    line = line_of(two(4))
     line.bus.servo(4).poke("model_number", 999)
-    (found,) = scan(ToolLine(line), Search((2.0,), (57_600,), (4,))).servos
+    (found,) = scanned(line, 4).servos
     assert found.model == ""
     assert "model number 999" in found.remarks[0]
 
 
 def test_rates_that_the_adapter_cannot_are_left_out_and_reported():
-    line = VirtualLine(two(4), cannot=(10_500_000, 6_000_000))
-    found = scan(ToolLine(line), Search((2.0,), (), (4,)))
+    found = scanned(line_of(two(4), cannot=(10_500_000, 6_000_000)), 4, rates=())
     assert found.left_out == (10_500_000, 6_000_000)
     assert len(found.servos) == 1
 
@@ -138,18 +131,18 @@ def test_rates_that_the_adapter_cannot_are_left_out_and_reported():
 def test_an_adapter_that_echoes_is_refused(protocol, ids):
     line = VirtualLine(protocol=protocol, adapter=AdapterConfig(echo=True))
     with pytest.raises(PortError, match="echoes every instruction"):
-        scan(ToolLine(line), Search((protocol,), (57_600,), ids))
+        scanned(line, *ids, protocols=(protocol,))
 
 
 def test_a_line_that_is_gone_ends_the_scan():
-    line = VirtualLine(two(4))
+    line = line_of(two(4))
     line.ports.ports[0].unplug()
     with pytest.raises(PortError):
         scan(ToolLine(line))
 
 
 def test_one_id_is_found_wherever_it_is():
-    line = VirtualLine(two(9), rate=4_000_000)
+    line = line_of(two(9), rate=4_000_000)
     (found,) = find_servo(ToolLine(line), 9)
     assert (found.protocol, found.baud_rate, found.model) == (2.0, 4_000_000, "XM430-W350")
     assert find_servo(ToolLine(line), 8) == ()
@@ -163,17 +156,14 @@ def test_the_rates_are_those_of_the_tables_and_the_usual_ones_come_first():
 
 def test_progress_goes_from_nothing_to_everything():
     shares = []
-    scan(
-        ToolLine(VirtualLine()), Search((1.0, 2.0), (57_600,), (1, 2)), lambda _, share: shares.append(share)
-    )
-    assert shares[0] == 0.0
+    search = Search((1.0, 2.0), (57_600,), (1, 2))
+    scan(ToolLine(VirtualLine()), search, lambda _, share: shares.append(share))
+    assert (shares[0], shares[-1]) == (0.0, 1.0)
     assert shares == sorted(shares)
-    assert shares[-1] == 1.0
 
 
 def test_few_ids_are_asked_one_by_one():
-    few = tuple(range(scanning.FEW))
-    line = VirtualLine(two(3), two(11))
-    found = scan(ToolLine(line), Search((2.0,), (57_600,), few))
+    line = line_of(two(3), two(11))
+    found = scanned(line, *range(scanning.FEW))
     assert [one.servo_id for one in found.servos] == [3, 11]
     assert all(data[4] != 0xFE for data in line.heard)

@@ -7,6 +7,7 @@ from functools import partial
 import pytest
 from msgspec.structs import replace
 from tests.kit.line_faults import delay_next, disturb_replies, truncate_next
+from tests.kit.plans import distinct_tables
 from tests.kit.rigs import make_plan, make_rig, make_x, start_rig
 
 from dxlrun.channels.event_records import EventCode, Severity
@@ -19,7 +20,7 @@ from dxlrun.features.registers.settings import declarable, register_value
 from dxlsim.bus.simulated_bus import PacketFault
 from dxlsim.bus.simulated_line import flipped
 from dxlsim.simulation_plan import ServoConfig
-from dxlwire.control_table import all_tables, find_table
+from dxlwire.control_table import find_table
 from dxlwire.wire import protocol1
 
 
@@ -189,7 +190,7 @@ def others(table):
 
 @pytest.mark.parametrize("protocol", [1.0, 2.0])
 def test_whatever_may_be_declared_of_any_model_is_written_once_and_then_there(protocol):
-    tables = [table for table in all_tables() if table.protocol == protocol]
+    tables = [table for table in distinct_tables() if table.protocol == protocol]
     assert tables
     for table in tables:
         plan = make_plan((5,), protocol=protocol, model=table.model, reference=1.5, lower=-0.1, upper=0.1)

@@ -10,11 +10,21 @@ from msgspec.structs import replace
 
 from dxlwire.bus_plan import BusPlan
 from dxlwire.clock import VirtualClock
-from dxlwire.control_table import find_table
+from dxlwire.control_table import ControlTable, all_tables, find_table
 from dxlwire.plan.planning import Wiring, bus_plan
 from dxlwire.port.ports import OwnProcessors
 
 MIDDLE = math.radians(150)
+
+
+def distinct_tables() -> list[ControlTable]:
+    """Return a control table of each layout, with its errors: several models share one."""
+    tables = {}
+    for table in all_tables():
+        layout = tuple((item.name, item.address) for item in table.items.values())
+        errors = (table.errors.item, *table.errors.values.items())
+        tables[table.protocol, layout, errors] = table
+    return [*tables.values()]
 
 
 class ScriptedLine(OwnProcessors):
