@@ -213,7 +213,7 @@ class Watched:
                 assert way == pytest.approx(max(room, 0.0), abs=1e-7) or np.isnan(room)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=300, deadline=None)
 @given(seed=st.integers(0, 1 << 32), count=st.integers(1, 3), cycles=st.integers(1, 60))
 def test_goals_keep_their_promises(seed, count, cycles):
     random = Random(seed)
@@ -420,6 +420,19 @@ def test_a_joint_that_follows_its_velocity_never_passes_a_limit_nor_brakes_harde
 
 
 @SIDES
+def test_a_joint_that_is_driven_toward_its_limit_brakes_within_the_acceleration(side):
+    rig = rig_of(Mode.VELOCITY, acceleration=5.0)
+    place, speeds = 0.0, [0.0]
+    for _ in range(400):
+        place += speeds[-1] * 0.01
+        rig.states.position[:] = place
+        speeds.append(rig.apply(velocity=side * 9.0).velocity)
+    assert np.abs(np.diff(speeds)).max() == pytest.approx(0.05)
+    assert place == pytest.approx(side * 1.0, abs=1e-6)
+    assert max(np.abs(speeds)) > 1.5
+
+
+@SIDES
 def test_a_servo_that_lags_its_velocity_rests_at_the_limit_without_overshoot(side):
     rig = GateRig(Mode.VELOCITY, velocity=2.0, dt_ns=1_000_000)
     place = speed = 0.0
@@ -456,7 +469,10 @@ def test_a_joint_that_is_driven_against_its_limit_stops_there_and_comes_back(mod
 @SIDES
 def test_a_joint_beyond_its_limit_is_let_back_slowly_and_not_pulled(side):
     rig = GateRig(Mode.EFFORT, start=side * 1.3)
-    assert rig.apply(effort=side * 0.3)[2::3] == (0.0, Clamp.OUTWARD)
+    for speed in (0.0, 0.3):
+        rig.states.velocity[:] = -side * speed
+        assert rig.apply(effort=side * 0.3)[2::3] == (0.0, Clamp.OUTWARD)
+    rig.states.velocity[:] = 0.0
     assert rig.apply(effort=side * -0.3).effort == side * -0.3
     rig.states.position[:] = side * 1.2  # it has come nearer, which it keeps
     rig.apply()

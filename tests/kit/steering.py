@@ -121,6 +121,7 @@ class Scripted(dxlrun.Controller[ScriptedParameters]):
             self.left += 1 if self.left < 0 else -1
             if self.left in (0, -1):
                 self.goal.end(dxlrun.Outcome.REACHED if self.left == 0 else dxlrun.Outcome.CANCELLED)
+                self.goal.feedback(0.5)  # too late: it changes nothing
                 self.goal = None
 
 
@@ -372,7 +373,9 @@ def requesting(act: str) -> Callable[..., None]:
     def request(story: Story, name: str, *words: str) -> None:
         def do(controller: Scripted) -> None:
             if act == "take_over":
-                controller.context.take_over(words[0].split(), words[1])
+                controller.context.take_over(words[0].split(), words[2])
+                if words[1]:
+                    raise RuntimeError("broken")
             elif act == "end_run":
                 controller.context.end_run(words[0])
             else:
@@ -415,7 +418,7 @@ ACTIONS: dict[str, Callable[..., None]] = {
     ),
     r"send (\w+) (\w+)(?: (\{.*\}))?(?: for (\S+) s)?": command,
     r"(\w+) breaks(?: in (\w+))?": breaking,
-    r"(\w+) requests (.+?): (.+)": requesting("take_over"),
+    r"(\w+) requests (.+?)( and breaks)?: (.+)": requesting("take_over"),
     r"(\w+) ends the run: (.+)": requesting("end_run"),
     r"(\w+) commands (\S+)": requesting("command"),
     r"hand (\w+) to (\S+)": Story.turn,
