@@ -5,6 +5,8 @@ import json
 import socket
 import time
 from contextlib import suppress
+from functools import cache
+from pathlib import Path
 from types import SimpleNamespace
 from typing import ClassVar
 
@@ -20,7 +22,8 @@ from dxlrun.channels.event_records import LONGEST_EVENT, EventRing
 from dxlrun.channels.heartbeat import Heartbeat, Phase
 from dxlrun.channels.mailbox import Mailbox
 from dxlrun.channels.topic_messages import LONGEST_RECORD, MessageRing
-from dxlrun.control.controllers.plugin_loading import Offer, PlugIns
+from dxlrun.compile import robot_compiler
+from dxlrun.control.controllers.plugin_loading import Offer, PlugIns, load_plugins
 from dxlrun.plan.loop_plan import ControllerPlan, JointPlan, LoopPlan, SchedulerPlan
 from dxlrun.plan.recording_plan import RecordingPlan
 from dxlrun.plan.robot_plan import Plan
@@ -31,8 +34,11 @@ from dxlrun.remote.preparation import Preparation
 from dxlrun.remote.requests.replies import FRAME_LENGTH, Frame
 from dxlrun.remote.requests.request_table import Role
 from dxlrun.remote.server import serve_gateway
+from dxlrun.testing import plan_of
 
 PERIOD_NS = 20_000_000
+TEXTS = Path(__file__).with_name("requests")
+"""Robot files with requests; see `test_request_texts.py`."""
 
 
 class Go(dxlrun.CommandModel):
@@ -91,6 +97,50 @@ class Arm(dxlrun.Controller[ArmParameters]):
 
     def update(self, time_ns, period_ns):
         pass
+
+
+class Points(dxlrun.CommandModel):
+    points: list[dict[str, float | list[float]]]
+    start_in: float
+
+
+class Whole(dxlrun.Controller[dxlrun.ParametersModel]):
+    """Takes trajectories of all joints."""
+
+    Commands: ClassVar = {"trajectory": Points}
+
+    @classmethod
+    def interfaces(cls, parameters, joints):
+        return dxlrun.Interfaces(joints, ("position",))
+
+    @classmethod
+    def prepare(cls, kind, command, parameters):
+        (point,) = command.points
+        return np.array([command.start_in, point["time"], *point["positions"]])
+
+    def update(self, time_ns, period_ns):
+        pass
+
+
+@cache
+def plugins():
+    own = {name: Offer(name, cls, "tests 1") for name, cls in (("arm", Arm), ("whole", Whole))}
+    return PlugIns({**load_plugins().controllers, **own}, {}, drivers=load_plugins().drivers)
+
+
+@pytest.fixture(scope="module")
+def plan_in(tmp_path_factory):
+    """Return the plan of a text's robot, compiled once."""
+
+    @cache
+    def compiled(name):
+        file = tmp_path_factory.mktemp("requests") / "robot.yaml"
+        file.write_text((TEXTS / name).read_text("utf-8").partition("====\n")[0])
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(robot_compiler, "load_plugins", lambda **_: plugins())
+            return plan_of(file)
+
+    return compiled
 
 
 def controller(name, joint, active=True):

@@ -6,52 +6,22 @@ import asyncio
 import json
 
 import pytest
-from msgspec.structs import replace
+from tests.remote.conftest import plugins
 
 from dxlrun.channels.answers import Acceptance, Code, Completion, Refusal
 from dxlrun.channels.cycle import Torque
-from dxlwire.control_table import find_table
-from dxlwire.plan.planning import Wiring, bus_plan
 
 GAIN = "/joints/pan/registers/position_p_gain"
 
 
 @pytest.fixture
-def arm(desk):
+def arm(desk_of, plan_in):
     """Return the desk of a robot with two XM430."""
-    table = find_table("XM430-W350", 2.0)
-    wirings = [
-        Wiring(name, row, 11 + row, table, 3.14, 1, -1.0, 1.0) for row, name in enumerate(("pan", "tilt"))
-    ]
-    bus = bus_plan(
-        name="main",
-        port="sim",
-        baud_rate=1_000_000,
-        latency_ns=0,
-        return_delay_ns=0,
-        joints=wirings,
-        protocol=2.0,
-    )
-    desk.link.plan = replace(desk.link.plan, buses=(bus,))
-    return desk
-
-
-@pytest.mark.parametrize(
-    ("item", "given", "raw"),
-    [("position_p_gain", 900, 900), ("profile_acceleration", "10 rad/s^2", 27), ("led", 1, 1)],
-)
-def test_the_loop_gets_the_integer_of_the_wire(arm, item, given, raw):
-    assert arm.ask("POST", f"/joints/pan/registers/{item}", {"value": given}) == (
-        200,
-        {"done": True, "cycle": 0, "value": raw},
-    )
-    (taken,) = arm.taken
-    assert (taken.controller, taken.kind) == ("", "register")
-    assert json.loads(taken.data) == {"joint": "pan", "item": item, "value": raw}
+    return desk_of(plan_in("joints.txt"), plugins())
 
 
 def test_a_servos_failure_is_the_answer(arm):
-    said = "pan (ID 11 on bus main) did not answer"
+    said = "pan (ID 1 on bus main) did not answer"
     refusal = Refusal(Code.REGISTER_NOT_WRITTEN, {"problem": said})
     status, content = arm.ask("POST", GAIN, {"value": 1}, refusal=refusal)
     assert (status, content["refused"], content["code"]) == (409, said, "register_not_written")
@@ -89,25 +59,6 @@ def test_a_joints_state_is_answered(arm):
     assert status == 200
     assert (content["joint"], content["position"], content["torque"]) == ("tilt", 0.25, "limp")
     assert (content["effort_unit"], content["velocity"]) == ("A", None)
-
-
-@pytest.mark.parametrize(
-    ("names", "joints"),
-    [
-        (["tilt"], ["tilt"]),
-        (["left"], ["pan"]),
-        (["all"], ["pan", "tilt"]),
-        (["tilt", "both"], ["tilt", "pan"]),
-        (["tilt", "right", "pan"], ["tilt", "pan"]),
-    ],
-)
-@pytest.mark.parametrize("kind", ["torque", "reboot"])
-def test_joints_and_groups_are_named(arm, kind, names, joints):
-    data = {"on": False} if kind == "torque" else {}
-    status, content = arm.ask("POST", f"/{kind}", {"joints": names, **data}, refusal=Completion(-1))
-    assert (status, content["joints"]) == (200, joints)
-    (taken,) = arm.taken
-    assert (taken.kind, json.loads(taken.data)) == (kind, {"joints": joints, **data, "release": False})
 
 
 def test_waiting_answers_keep_the_client_waiting(arm):
