@@ -5,40 +5,17 @@ import json
 import msgspec
 import numpy as np
 import pytest
+from tests.remote.conftest import plugins
 
 from dxlrun.cli.steering.joints import source_facts
-from dxlrun.control.controllers.plugin_loading import load_plugins
 from dxlrun.messages.cdr import Codec
 from dxlrun.messages.definition import MessageType
 from dxlrun.remote.live.states import RobotStates, array
-from dxlrun.testing import plan_of
-
-ROBOT = """\
-name: with_board
-loop: {rate: 50}
-buses: {main: {port: sim, protocol: 2.0, baud_rate: 1_000_000}}
-joints: {neck: {bus: main, id: 1, model: XL430-W250, reference: 180 deg, direction: 1}}
-devices:
-  foot: {bus: main, id: 101, model: generic, states: {force.x: register_1}}
-  board:
-    {bus: main, id: 102, model: generic, states: [led, register_2], commands: [led, register_7, register_8]}
-controllers:
-  neck: {type: joint_group_position_controller, joints: [neck]}
-  lamps: {type: device_command_controller, commands: [board/register_7, board/led]}
-  away: {type: device_command_controller, commands: [board/register_8], active: false}
-"""
-
-
-@pytest.fixture(scope="module")
-def plan(tmp_path_factory):
-    file = tmp_path_factory.mktemp("robot") / "robot.yaml"
-    file.write_text(ROBOT)
-    return plan_of(file)
 
 
 @pytest.fixture
-def board(desk_of, plan):
-    desk = desk_of(plan, load_plugins())
+def board(desk_of, plan_in):
+    desk = desk_of(plan_in("devices.txt"), plugins())
     desk.record.sources.values[:] = 12.5, 1.0, np.nan
     desk.record.sources.age_ns[:] = 3_000_000, -1
     desk.record.sources.valid[:] = True, False
@@ -48,15 +25,6 @@ def board(desk_of, plan):
 
 def send(board, device, **values):
     return board.ask("POST", f"/controllers/{device}/commands/device_commands?units=true", values)
-
-
-def test_a_devices_commands_go_to_the_controller_that_has_them(board):
-    status, content = send(board, "board", led=1)
-    assert (status, content["done"]) == (200, True)
-    (taken,) = board.taken
-    assert (taken.controller, taken.kind) == ("lamps", "device_commands")
-    np.testing.assert_array_equal(np.frombuffer(taken.data), [np.nan, 1.0])
-    assert json.loads(taken.request) == {"values": {"board/led": 1}}
 
 
 def test_a_command_that_no_controller_takes_names_the_type_that_would(board, monkeypatch):
