@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NoReturn
 
 import pytest
+from tests.kit.commands import Dxlrun
+from tests.kit.examples import as_parameters
 
 from dxlrun.channels.cycle import CycleRecord
 from dxlrun.cli.steering import steer, watch
@@ -23,117 +25,91 @@ from dxlrun.testing import plan_of, simulated_robot
 pytestmark = pytest.mark.long
 
 ROBOTS = sorted((Path(__file__).parents[2] / "robots").glob("*.yaml"))
+LISTED = ["name", "type", "active", "joints", "command", "into"]
+SOURCES = ["name", "kind", "states", "commands", "ranges"]
 
 
 def texts(lines: Iterable[terminal.Line]) -> list[str]:
     return ["".join(text for text, _ in line).rstrip() for line in lines]
 
 
-class Seen(list[Table]):
-    """Tables that were shown; no line of them is too long."""
-
-    def check(self, table: Table, shown: list[str]) -> None:
-        assert max(map(len, shown)) <= 80, table.title
-        self.append(table)
-
-
 @pytest.fixture
-def seen(monkeypatch: pytest.MonkeyPatch) -> Iterator[Seen]:
+def seen(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Table]]:
     """Stand for a terminal of 80 columns, and check the tables that it gets."""
-    seen, fitted = Seen(), terminal.fitted
+    seen: list[Table] = []
+    fitted = terminal.fitted
 
     def checked(table: Table, width: int) -> list[terminal.Line]:
         assert width == 80
         shown = fitted(table, width)
-        seen.check(table, texts(shown))
+        assert max(map(len, texts(shown))) <= 80, table.title
+        seen.append(table)
         return shown
-
-    monkeypatch.setattr(terminal.out, "__defaults__", (80,))
 
     def paragraphs(table: Table, width: int) -> NoReturn:
         raise AssertionError(f"{table.title} of {table.columns} is folded into paragraphs")
 
+    monkeypatch.setattr(terminal.out, "__defaults__", (80,))
     monkeypatch.setattr(terminal, "fitted", checked)
     monkeypatch.setattr(terminal, "_paragraphs", paragraphs)
     yield seen
     assert seen or not find_spec("mujoco")
 
 
-def needs_extra(robot: Path) -> None:
-    if "physics: mujoco" in robot.read_text():
-        pytest.importorskip("mujoco")
-
-
-@pytest.mark.parametrize("robot", ROBOTS, ids=lambda path: path.stem)
-def test_a_check(dxlrun: Callable[..., Any], seen: Seen, robot: Path) -> None:
-    needs_extra(robot)
+@pytest.mark.parametrize("robot", as_parameters(ROBOTS))
+def test_check(dxlrun: Dxlrun, seen: list[Table], robot: Path) -> None:
     said = dxlrun("check", robot)
     assert said.code == 0
     joints = next(table for table in seen if table.title.startswith("Joints"))
     assert len(said.out.splitlines()) < 90 + len(joints.rows)
 
 
+MODELS = ("AX-12A", "MX-106", "XM430-W350", "PH54-200-S500-R", "OpenCR")
+
+
 @pytest.mark.parametrize(
-    "words",
-    [
-        ("plugins",),
-        ("examples",),
-        ("models",),
-        *(("models", model) for model in ("AX-12A", "MX-106", "XM430-W350", "PH54-200-S500-R", "OpenCR")),
-        ("doctor",),
-    ],
-    ids=" ".join,
+    "words", ["plugins", "examples", "doctor", "models", *(f"models {model}" for model in MODELS)]
 )
-def test_a_list(dxlrun: Callable[..., Any], seen: Seen, words: tuple[str, ...]) -> None:
-    assert dxlrun(*words).code == 0
+def test_list(dxlrun: Dxlrun, seen: list[Table], words: str) -> None:
+    assert dxlrun(*words.split()).code == 0
 
 
-@pytest.mark.parametrize("robot", ROBOTS, ids=lambda path: path.stem)
-def test_a_robot_that_runs(seen: Seen, robot: Path) -> None:
-    needs_extra(robot)
+@pytest.mark.parametrize("robot", as_parameters(ROBOTS))
+def test_robot_that_runs(seen: list[Table], robot: Path) -> None:
     plan = plan_of(robot)
     loop = plan.loop
     preparation = Preparation({joint.name: joint for joint in loop.joints}, load_plugins())
     listed = [
-        {name: getattr(one, name) for name in ("name", "type", "active", "joints", "command", "into")}
+        {name: getattr(one, name) for name in LISTED}
         | {"held": False, "rate": 50.0, "takes": preparation.takes(one)}
         for one in loop.controllers
     ]
-    sources = [
-        {name: getattr(one, name) for name in ("name", "kind", "states", "commands", "ranges")}
-        for one in loop.sources
-    ]
+    sources = [{name: getattr(one, name) for name in SOURCES} for one in loop.sources]
     record = CycleRecord(loop.layout)
-    for values in (
-        record.states.motion,
-        record.goals.values,
-        record.states.temperature,
-        record.states.voltage,
-    ):
+    states = record.states
+    for values in (states.motion, record.goals.values, states.temperature, states.voltage):
         values[:] = -123.4
-    record.states.torque[:], record.states.hardware_error[:], record.states.valid[:] = 4, 0x24, True
+    states.torque[:], states.hardware_error[:], states.valid[:] = 4, 0x24, True
     record.sources.values[:], record.sources.age_ns[:] = -1.2345, 123_400_000
     record.controller_ns[:] = 100_000
     places = {one.name: place for place, one in enumerate(loop.controllers)}
-    watched: Any = SimpleNamespace(
-        info={"controllers": listed},
-        states=states_of(plan, record, places),
-    )
-    terminal.show_parts(steer.controllers({"controllers": listed}), steer.sources({"sources": sources}))
+    info = {"controllers": listed}
+    watched: Any = SimpleNamespace(info=info, states=states_of(plan, record, places))
+    terminal.show_parts(steer.controllers(info), steer.sources({"sources": sources}))
     terminal.show_parts(steer.groups({"groups": plan.groups}))
     terminal.show_parts(watch.joints(watched), watch.sources(watched), watch.controllers(watched))
 
 
 @pytest.mark.needs("logs")
 @pytest.mark.parametrize("name", ["bioloid_torso", "humanoid_20", "wolfgang", "mechanics"])
-def test_a_log(dxlrun: Callable[..., Any], seen: Seen, name: str, tmp_path: Path) -> None:
+def test_log(dxlrun: Dxlrun, seen: list[Table], name: str, tmp_path: Path) -> None:
     log = tmp_path / f"{name}.mcap"
     simulated_robot(ROBOTS[0].parent / f"{name}.yaml", duration_s=0.5, log=log).run()
     assert dxlrun("analyze", log).code in (0, 1)
     assert dxlrun("logs", tmp_path).code == 0
 
 
-def test_a_line_that_changes_fits_beside_its_spinner(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_line_that_changes_fits_next_to_its_spinner(monkeypatch: pytest.MonkeyPatch) -> None:
     lines: list[str] = []
     monkeypatch.setattr(run_summary, "_REFRESH_S", -1.0)
     console = SimpleNamespace(is_terminal=True)
@@ -148,16 +124,14 @@ def test_a_line_that_changes_fits_beside_its_spinner(monkeypatch: pytest.MonkeyP
     assert lines[0].startswith("torso: 36001.2 of 86400.0 s, 1234 periods skipped")
 
 
-def test_what_is_equal_in_all_rows_is_said_once_and_what_is_too_wide_is_cut() -> None:
+def test_what_is_equal_in_all_rows_is_written_once_and_what_is_too_wide_is_cut() -> None:
     columns = [Column("name", "name"), Column("bus", "name"), Column("remark", "text"), Column("number")]
     table = Table.from_rows("", columns, [("a", "main_bus", "word " * 5, 1), ("c", "main_bus", "other", 2)])
     caption, *lines = texts(terminal.fitted(table, 44))
     assert caption == "in all rows: bus main_bus"
     assert "main_bus" not in "".join(lines)
-    names = [Column(name, "name") for name in "abc"]
-    wide = Table.from_rows(
-        "", [*names, Column("d")], [("left_shoulder_" * 3, "b" * 30, "c", 1), ("a", "b", "d", 2)]
-    )
+    columns = [*(Column(name, "name") for name in "abc"), Column("d")]
+    wide = Table.from_rows("", columns, [("left_shoulder_" * 3, "b" * 30, "c", 1), ("a", "b", "d", 2)])
     lines = texts(terminal.fitted(wide, 60))
     assert "left_shoulder_left_shoulde… " in "".join(lines)
     assert max(map(len, lines)) <= 60
