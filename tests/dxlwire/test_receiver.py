@@ -41,8 +41,8 @@ class Heard:
 header_bytes = st.lists(st.sampled_from([0xFF, 0xFF, 0xFD, 0xFD, 0x00, 0x55]), max_size=20).map(bytes)
 any_bytes = header_bytes | st.binary(max_size=30)
 both = pytest.mark.parametrize("dialect", [protocol1, protocol2], ids=["protocol 1", "protocol 2"])
-often = settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-statuses = st.tuples(st.integers(0, 252), st.integers(0, 255), any_bytes.map(lambda data: data[:20]))
+often = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+statuses = st.tuples(st.integers(0, 252), st.integers(0, 255), header_bytes | st.binary(max_size=20))
 
 
 def quiet(noise, dialect):
