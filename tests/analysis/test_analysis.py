@@ -1,4 +1,4 @@
-"""Analysis: runs that are known to the last number, and what is said of them."""
+"""Analysis: runs that are known to the last number, and what is said of them on terminals of any width."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from statistics import median
-from typing import Any
 
 import pytest
 from rich.console import Console
@@ -19,7 +18,7 @@ from dxlrun.errors import LogError
 from dxlrun.log.log_reader import read_log
 from dxlrun.output.json import json_text
 from dxlrun.output.terminal import show_parts
-from dxlrun.output.text_table import microseconds
+from dxlrun.output.text_table import Table, microseconds
 from dxlrun_analysis.cycles.punctuality import Durations, Punctuality
 from dxlrun_analysis.parts.cycles import CONTROLLERS, STEPS
 from dxlrun_analysis.parts.history import EVENTS
@@ -27,21 +26,21 @@ from dxlrun_analysis.parts.part import Report
 from dxlrun_analysis.report import analyze_log, parts, tables
 from dxlwire.packets import PacketKind
 
-Make = Callable[..., Any]
+Write = Callable[..., Path]
 ASK_5 = bytes.fromhex("ffff0504022406ca")
 ASK_21 = bytes.fromhex("ffff1504022406ba")
 ANSWER = bytes.fromhex("ffff05080000020000000000f0")
 GOALS = bytes.fromhex("fffffe0483")
 
 
-def shown(report: Report) -> str:
-    console = Console(file=io.StringIO(), width=160)
-    show_parts(*parts(report), console=console)
-    text: str = console.file.getvalue()  # type: ignore[attr-defined]  # a StringIO, given above
-    return text
+def shown(report: Report, width: int = 160, *, only_tables: bool = False) -> str:
+    file = io.StringIO()
+    console = Console(file=file, width=width, force_terminal=only_tables or None, color_system=None)
+    show_parts(*(one for one in parts(report) if isinstance(one, Table) or not only_tables), console=console)
+    return file.getvalue()
 
 
-def asked_and_answered(at: int, error: int = 0) -> list[Any]:
+def asked_and_answered(at: int, error: int = 0) -> list[Wire]:
     answer = bytearray(ANSWER)
     answer[4] = error
     return [
@@ -50,51 +49,58 @@ def asked_and_answered(at: int, error: int = 0) -> list[Any]:
     ]
 
 
-def test_a_good_run_is_good(write: Make) -> None:
-    packets = [packet for at in (0, 20_000) for packet in asked_and_answered(at)]
-    report = analyze_log(
-        write([Cycle(number, late=83 if number == 7 else 60) for number in range(50)], packets)
-    )
-    assert report.verdict.good
-    assert report.verdict.sentences == (
+def test_good_run_is_good(write: Write) -> None:
+    packets = asked_and_answered(0) + asked_and_answered(20_000)
+    cycles = [Cycle(number, late=83 if number == 7 else 60) for number in range(50)]
+    verdict = analyze_log(write(cycles, packets)).verdict
+    assert verdict.good
+    assert verdict.sentences == (
         "Good: ran for 1.0 s without a motion.",
         "The loop kept 50 Hz: 0 of 50 periods skipped, worst wake-up 83 us late.",
         "The servo answered every time.",
     )
 
 
-def test_the_wake_up_latency_is_that_of_the_records(write: Make) -> None:
+def test_run_without_a_cycle_is_reported(write: Write) -> None:
+    report = analyze_log(write())
+    assert not report.verdict.good
+    assert report.verdict.sentences == (
+        "Not good: the loop never ran a cycle.",
+        "The loop never ran a cycle.",
+    )
+    assert (report.totals.latency, STEPS.numbers_of(report)) == (None, ())
+    assert "torso" in shown(report)
+
+
+# Cycles
+
+
+def test_wake_up_latency_is_that_of_the_records(write: Write) -> None:
     late = [4, 4, 4, 62, 151, 1001, 20_001, 3]
     latency = analyze_log(write([Cycle(number, late=us) for number, us in enumerate(late)])).totals.latency
     assert latency is not None
     mean = sum(late) / 8
-    assert latency.max_us == 20_001
     assert latency.mean_us == pytest.approx(mean)
     assert latency.deviation_us == pytest.approx((sum((us - mean) ** 2 for us in late) / 8) ** 0.5)
-    assert latency.mode_us == 4
-    assert (latency.share_over_150_us, latency.share_over_1_ms, latency.share_over_period) == (
-        3 / 8,
-        2 / 8,
-        1 / 8,
-    )
+    assert (latency.max_us, latency.mode_us) == (20_001, 4)
+    shares = latency.share_over_150_us, latency.share_over_1_ms, latency.share_over_period
+    assert shares == (3 / 8, 2 / 8, 1 / 8)
     assert (latency.median_us, latency.p99_us, latency.p999_us) == (33, 20_001, 20_001)
 
 
-def test_percentiles_of_wake_ups_are_values_that_occurred(write: Make) -> None:
+def test_percentiles_of_wake_ups_are_values_that_occurred(write: Write) -> None:
     late = [(number * 7919) % 2003 for number in range(2000)]
     report = analyze_log(write([Cycle(number, late=us) for number, us in enumerate(late)]))
     expected = [sorted(late)[rank - 1] for rank in (1980, 1998)]
-    assert report.totals.latency is not None
-    assert [report.totals.latency.p99_us, report.totals.latency.p999_us] == expected
-    assert report.totals.latency.median_us == median(late)
+    latency = report.totals.latency
+    assert latency is not None
+    assert [latency.p99_us, latency.p999_us, latency.median_us] == [*expected, median(late)]
     rows = {str(row[0].text): row[1].text for row in tables(report)["periods"].rows}
     assert [rows[name] for name in ("  99 %", "  99.9 %")] == [microseconds(us) for us in expected]
 
 
-def test_the_steps_take_the_times_of_the_records(write: Make) -> None:
-    cycles = [
-        Cycle(number, late=50, read=5000 + number, update=100, write=300 - number) for number in range(101)
-    ]
+def test_steps_take_the_times_of_the_records(write: Write) -> None:
+    cycles = [Cycle(n, late=50, read=5000 + n, update=100, write=300 - n) for n in range(101)]
     report = analyze_log(write(cycles))
     steps = {step.name: (step.median_us, step.p99_us, step.max_us) for step in STEPS.numbers_of(report)}
     assert steps["read"] == pytest.approx((5050, 5099, 5100))
@@ -106,19 +112,14 @@ def test_the_steps_take_the_times_of_the_records(write: Make) -> None:
     assert (idle.name, idle.cycles) == ("idle", 0)
 
 
-def test_periods_that_were_skipped_are_accounted_for(write: Make) -> None:
+def test_periods_that_were_skipped_are_accounted_for(write: Write) -> None:
     report = analyze_log(write([Cycle(0), Cycle(1), Cycle(22, skipped=20), Cycle(23)]))
-    assert (report.totals.periods.elapsed, report.totals.periods.records, report.totals.periods.skipped) == (
-        24,
-        4,
-        20,
-    )
-    assert (report.totals.periods.missing, report.totals.periods.agree) == (0, True)
+    periods = report.totals.periods
+    assert (periods.elapsed, periods.records, periods.skipped) == (24, 4, 20)
+    assert (periods.missing, periods.agree) == (0, True)
     assert not report.verdict.good
-    assert (
-        "did not keep 50 Hz: 20 of 24 periods skipped (83.33%; 10 tolerated in a short run)"
-        in report.verdict.sentences[1]
-    )
+    told = "did not keep 50 Hz: 20 of 24 periods skipped (83.33%; 10 tolerated in a short run)"
+    assert told in report.verdict.sentences[1]
 
 
 @pytest.mark.parametrize(
@@ -126,54 +127,29 @@ def test_periods_that_were_skipped_are_accounted_for(write: Make) -> None:
     [[(0, 0), (1, 0), (4, 0)], [(0, 0), (3, 1)], [(0, 0), (3, 0), (4, 2)], [(2, 0)]],
     ids=["undeclared", "half declared", "declared late", "no beginning"],
 )
-def test_periods_that_vanished_are_reported(write: Make, numbers: list[tuple[int, int]]) -> None:
+def test_periods_that_vanished_are_reported(write: Write, numbers: list[tuple[int, int]]) -> None:
     report = analyze_log(write([Cycle(number, skipped=skipped) for number, skipped in numbers]))
     assert not report.totals.periods.agree
     assert not report.verdict.good
     assert any("neither recorded nor declared skipped" in one for one in report.verdict.sentences)
 
 
-def test_a_servo_that_was_silent_is_named(write: Make) -> None:
-    packets = asked_and_answered(0)
-    packets += [
-        Wire(PacketKind.INSTRUCTION, 21, 1000, ASK_21),
-        Wire(PacketKind.NOISE, 254, 1500, b"\xff\x00\xff"),
-        Wire(PacketKind.INSTRUCTION, 254, 2000, GOALS),
-        Wire(PacketKind.INSTRUCTION, 21, 3000, ASK_21),
-        Wire(PacketKind.INSTRUCTION, 254, 4000, GOALS),
-    ]
-    report = analyze_log(write([Cycle(0)], packets))
-    elbow, head = report.totals.servos
-    assert (elbow.servo_id, elbow.joint, elbow.asked, elbow.lost, elbow.replies) == (
-        5,
-        "left_elbow_joint",
-        1,
-        0,
-        1,
-    )
-    assert (elbow.reply_median_us, elbow.reply_max_us) == (640, 640)
-    assert (head.servo_id, head.joint, head.asked, head.lost, head.replies) == (21, "head_yaw_joint", 2, 2, 0)
-    (bus,) = report.totals.buses
-    assert (bus.instructions, bus.broadcasts, bus.replies, bus.noise_bytes) == (5, 2, 1, 3)
-    assert (bus.bytes_out, bus.bytes_in) == (3 * 8 + 2 * 5, len(ANSWER) + 3)
-    assert report.verdict.sentences[2] == (
-        "Replies are missing: servo 21 (head_yaw_joint) 2 of 2 times (100.00%); "
-        "1 of 2 servos answered every time."
-    )
+@pytest.mark.parametrize(
+    ("cycles", "told"),
+    [
+        ([Cycle(0), Cycle(1, read=23_000)], "; a cycle took up to 23.40 ms, its read 23.00 ms: own work."),
+        (
+            [Cycle(number, late=200 if number < 3 else 10) for number in range(100)],
+            "worst wake-up 200 us late, 3.0% later than 150 us.",
+        ),
+    ],
+    ids=["a long cycle", "rough wake-ups"],
+)
+def test_long_cycle_and_rough_wake_ups_are_reported(write: Write, cycles: list[Cycle], told: str) -> None:
+    assert told in analyze_log(write(cycles)).verdict.sentences[1]
 
 
-def test_error_bits_are_named(write: Make) -> None:
-    packets = [*asked_and_answered(0), *asked_and_answered(20_000, error=0x24)]
-    report = analyze_log(write([Cycle(0)], packets))
-    assert report.totals.servos[0].error_names == ("overheating", "overload")
-    assert (
-        "Servos reported errors: servo 5 (left_elbow_joint): overheating, overload in 1 reply."
-        in report.verdict.sentences
-    )
-    assert not report.verdict.good
-
-
-def test_without_known_limits_tracking_compares_with_the_goal_of_the_cycle_before(write: Make) -> None:
+def test_without_known_limits_tracking_compares_with_the_goal_of_the_cycle_before(write: Write) -> None:
     cycles = [
         Cycle(0, position=0.0, goal=0.5),
         Cycle(1, position=0.4, goal=0.7, clamped=2),
@@ -187,17 +163,60 @@ def test_without_known_limits_tracking_compares_with_the_goal_of_the_cycle_befor
     assert (head.rms_rad, head.invalid) == (None, 0)
 
 
-def test_a_cycle_longer_than_its_period_is_reported_with_its_longest_step(write: Make) -> None:
-    sentences = analyze_log(write([Cycle(0), Cycle(1, read=23_000)])).verdict.sentences
-    assert sentences[1].endswith("; a cycle took up to 23.40 ms, its read 23.00 ms: own work.")
+def test_slices_give_what_the_whole_log_gives(write: Write) -> None:
+    numbers = [n for n in range(120) if n not in (38, 39)]
+    cycles = [Cycle(n, late=(n * 37) % 900, read=4000 + n, skipped=2 * (n == 40)) for n in numbers]
+    log = read_log(write(cycles))
+    whole, sliced = (Punctuality(), Durations()), (Punctuality(), Durations())
+    for one in whole:
+        one.add_slice(log)
+    for begin in range(0, len(log.cycles), 7):
+        for one in sliced:
+            one.add_slice(replace(log, cycles=log.cycles[begin : begin + 7], activation=None))
+    assert sliced[0].compute_latency() == whole[0].compute_latency()
+    assert sliced[1].compute_durations() == whole[1].compute_durations()
+    assert sliced[0].slowest == whole[0].slowest
 
 
-def test_rough_wake_ups_are_reported(write: Make) -> None:
-    report = analyze_log(write([Cycle(number, late=200 if number < 3 else 10) for number in range(100)]))
-    assert "worst wake-up 200 us late, 3.0% later than 150 us." in report.verdict.sentences[1]
+# Servos and events
 
 
-def test_errors_gaps_and_a_log_without_end_are_reported(write: Make) -> None:
+def test_servo_that_was_silent_is_named(write: Write) -> None:
+    packets = asked_and_answered(0)
+    packets += [
+        Wire(PacketKind.INSTRUCTION, 21, 1000, ASK_21),
+        Wire(PacketKind.NOISE, 254, 1500, b"\xff\x00\xff"),
+        Wire(PacketKind.INSTRUCTION, 254, 2000, GOALS),
+        Wire(PacketKind.INSTRUCTION, 21, 3000, ASK_21),
+        Wire(PacketKind.INSTRUCTION, 254, 4000, GOALS),
+    ]
+    report = analyze_log(write([Cycle(0)], packets))
+    elbow, head = report.totals.servos
+    assert (elbow.servo_id, elbow.joint, elbow.asked, elbow.lost) == (5, "left_elbow_joint", 1, 0)
+    assert (elbow.replies, elbow.reply_median_us, elbow.reply_max_us) == (1, 640, 640)
+    assert (head.servo_id, head.joint, head.asked, head.lost, head.replies) == (21, "head_yaw_joint", 2, 2, 0)
+    (bus,) = report.totals.buses
+    assert (bus.instructions, bus.broadcasts, bus.replies, bus.noise_bytes) == (5, 2, 1, 3)
+    assert (bus.bytes_out, bus.bytes_in) == (3 * 8 + 2 * 5, len(ANSWER) + 3)
+    missing = "Replies are missing: servo 21 (head_yaw_joint) 2 of 2 times (100.00%)"
+    assert report.verdict.sentences[2] == f"{missing}; 1 of 2 servos answered every time."
+
+
+def test_error_bits_are_named(write: Write) -> None:
+    packets = asked_and_answered(0) + asked_and_answered(20_000, error=0x24)
+    report = analyze_log(write([Cycle(number, late=60) for number in range(50)], packets))
+    assert report.totals.servos[0].error_names == ("overheating", "overload")
+    error = "Servos reported errors: servo 5 (left_elbow_joint): overheating, overload in 1 reply."
+    assert error in report.verdict.sentences
+    assert not report.verdict.good
+    robot, first, *others = shown(report).splitlines()
+    assert robot == "Not good: left_elbow_joint reported errors; ran for 1.0 s without a motion."
+    assert first.startswith("Servos reported errors: ")
+    for words in ("recorded + skipped = elapsed", "left_elbow_joint", "overload", "read", "head", "640 us"):
+        assert words in "\n".join(others)
+
+
+def test_errors_gaps_and_a_log_without_end_are_reported(write: Write) -> None:
     events = [
         Said(EventCode.LOOP_STARTED, Severity.INFO, "50 Hz"),
         Said(EventCode.CONTROLLER_FAULT, Severity.ERROR, "Traceback\nValueError: no"),
@@ -209,50 +228,26 @@ def test_errors_gaps_and_a_log_without_end_are_reported(write: Make) -> None:
     assert "still being written by a run" in report.verdict.sentences[2]
     assert "17 records were lost" in report.verdict.sentences[2]
     assert "ValueError: no" in shown(report)
-    assert [(event.name, event.count) for event in EVENTS.numbers_of(report)] == [
-        ("controller_fault", 1),
-        ("recorder_gap", 1),
-        ("loop_started", 1),
-    ]
+    counts = {event.name: event.count for event in EVENTS.numbers_of(report)}
+    assert counts == {"controller_fault": 1, "recorder_gap": 1, "loop_started": 1}
 
 
-def test_a_run_without_a_cycle_is_reported(write: Make) -> None:
-    report = analyze_log(write())
-    assert not report.verdict.good
-    assert report.verdict.sentences == (
-        "Not good: the loop never ran a cycle.",
-        "The loop never ran a cycle.",
-    )
-    assert (report.totals.latency, STEPS.numbers_of(report)) == (None, ())
-    assert "torso" in shown(report)
+# What is shown
 
 
-def test_the_terminal_shows_the_verdict_first_and_every_number_after(write: Make) -> None:
-    report = analyze_log(write([Cycle(number, late=60) for number in range(50)], asked_and_answered(0, 0x20)))
-    text = shown(report)
-    robot, first, *_ = text.splitlines()
-    assert robot == "Not good: left_elbow_joint reported errors; ran for 1.0 s without a motion."
-    assert first.startswith("Servos reported errors: ")
-    for words in ("recorded + skipped = elapsed", "left_elbow_joint", "overload", "read", "head", "640 us"):
-        assert words in text
-
-
-def test_json_carries_the_whole_report(write: Make) -> None:
+def test_json_carries_the_whole_report(write: Write) -> None:
     read = json.loads(json_text(analyze_log(write([Cycle(0)])).numbers))
     assert read["verdict"]["good"] is True
-    assert read["periods"] == {
-        "elapsed": 1,
-        "records": 1,
-        "skipped": 0,
-        "missing": 0,
-        "agree": True,
-        "rate_hz": 50.0,
-        "seconds": 0.02,
-        "rates_hz": [50.0],
-        "begin_ns": 1_000_000_000,
-    }
+    counts = {"elapsed": 1, "records": 1, "skipped": 0, "missing": 0, "agree": True}
+    times = {"rate_hz": 50.0, "seconds": 0.02, "rates_hz": [50.0], "begin_ns": 1_000_000_000}
+    assert read["periods"] == counts | times
     assert read["joints"][0]["name"] == "left_elbow_joint"
     assert set(read["extremes"][0]) == {"joint", "hottest_c", "lowest_volts"}
+
+
+@pytest.mark.parametrize(("value", "text"), [(83.4, "83 us"), (16_949.0, "16.95 ms"), (2.5e6, "2.50 s")])
+def test_times_are_written_in_fitting_units(value: float, text: str) -> None:
+    assert microseconds(value) == text
 
 
 def test_what_is_no_log_is_refused(tmp_path: Path) -> None:
@@ -261,25 +256,19 @@ def test_what_is_no_log_is_refused(tmp_path: Path) -> None:
         analyze_log(tmp_path / "robot.yaml")
 
 
-@pytest.mark.parametrize(("value", "text"), [(83.4, "83 us"), (16_949.0, "16.95 ms"), (2.5e6, "2.50 s")])
-def test_times_are_written_in_fitting_units(value: float, text: str) -> None:
-    assert microseconds(value) == text
-
-
-def test_slices_give_what_the_whole_log_gives(write: Make) -> None:
-    cycles = [
-        Cycle(n, late=(n * 37) % 900, read=4000 + n, skipped=2 * (n == 40))
-        for n in range(120)
-        if n not in (38, 39)
+def test_no_line_is_longer_than_the_terminal_or_than_reads_well(write: Write) -> None:
+    text = "torque is on: " + ", ".join(f"joint_number_{number}" for number in range(30))
+    events = [
+        Said(EventCode.TORQUE_ON, Severity.INFO, text),
+        Said(EventCode.READ_LOST, Severity.WARNING, "head (ID 21) did not answer"),
     ]
-    log = read_log(write(cycles))
-    whole = Punctuality(), Durations()
-    sliced = Punctuality(), Durations()
-    for one in whole:
-        one.add_slice(log)
-    for begin in range(0, len(log.cycles), 7):
-        for one in sliced:
-            one.add_slice(replace(log, cycles=log.cycles[begin : begin + 7], activation=None))
-    assert sliced[0].compute_latency() == whole[0].compute_latency()
-    assert sliced[1].compute_durations() == whole[1].compute_durations()
-    assert sliced[0].slowest == whole[0].slowest
+    report = analyze_log(write([Cycle(0), Cycle(1, position=0.25)], asked_and_answered(0), events))
+    lines = {width: shown(report, width, only_tables=True).splitlines() for width in (60, 80, 100, 120, 200)}
+    for width in (80, 100, 200):
+        assert max(len(line) for line in lines[width]) <= min(width, 120)
+    (servo,) = (line for line in lines[60] if line.startswith("main 5"))
+    assert servo.split() == ["main", "5", "left_elbow_joint", "1", "0", "0", "640", "us", "640", "us"]
+    for width in (60, 120):  # a wide terminal shows the details
+        assert any("instructions" in one and "slowest" in one for one in lines[width]) == (width == 120)
+    assert "head (ID 21) did not answer" in "\n".join(lines[120])
+    assert "head: head (ID 21)" not in "\n".join(lines[120])

@@ -26,10 +26,13 @@ def cause(kind: CauseKind, subject: str = "", servo: str = "") -> Cause:
     return Cause(kind, subject, 10, 70_000_000, 9_000_000, 70_000_000, servo)
 
 
+ARM, STOLEN = cause("controller", "left_arm"), cause("machine", STEAL)
+
+
 @pytest.mark.parametrize(
     ("one", "accused"),
     [
-        (cause("controller", "left_arm"), "left_arm"),
+        (ARM, "left_arm"),
         (cause("own work"), "loop"),
         (cause("write call", "bus main"), "main"),
         (cause("plan"), "loop"),
@@ -42,63 +45,44 @@ def test_work_of_the_loop_that_has_most_of_the_time_is_named(one: Cause, accused
     assert finding.share == pytest.approx(0.7)
 
 
-@pytest.mark.parametrize(
-    "one",
-    [
-        replace(cause("controller", "left_arm"), cycles=2),
-        replace(cause("controller", "left_arm"), long_ns=29_000_000),
-        cause("machine", STEAL),
-        cause("late wake-up"),
-        cause("late reply", "bus main"),
-        cause("missing reply", "servo 5 (elbow)", "elbow"),
-        cause("retry", "servo 5 (elbow)", "elbow"),
-        cause("unexplained"),
-    ],
-    ids=["twice", "less than half", "machine", "late", "late reply", "missing", "retry", "unexplained"],
-)
-def test_what_is_rare_small_or_told_elsewhere_is_no_finding(one: Cause) -> None:
-    assert found(one, OTHER) == []
+ELSEWHERE = {
+    "twice": replace(ARM, cycles=2),
+    "less than half": replace(ARM, long_ns=29_000_000),
+    "machine": STOLEN,
+    "late": cause("late wake-up"),
+    "late reply": cause("late reply", "bus main"),
+    "missing": cause("missing reply", "servo 5 (elbow)", "elbow"),
+    "retry": cause("retry", "servo 5 (elbow)", "elbow"),
+    "unexplained": cause("unexplained"),
+}
+
+
+@pytest.mark.parametrize("case", ELSEWHERE)
+def test_what_is_rare_small_or_told_elsewhere_is_no_finding(case: str) -> None:
+    assert found(ELSEWHERE[case], OTHER) == []
 
 
 def test_two_long_cycles_accuse_nothing() -> None:
-    assert found(cause("controller", "left_arm"), long=2) == []
+    assert found(ARM, long=2) == []
     assert found() == []
 
 
 @pytest.mark.parametrize(("cycles", "named"), [(10, True), (2, False)])
 def test_machine_that_made_most_of_the_long_cycles_is_named(cycles: int, named: bool) -> None:
-    stolen = replace(cause("machine", STEAL), cycles=cycles)
-    causes = Causes(5, 10, 100_000_000, (stolen, OTHER), throttled=4)
-    machine = [
-        one.sentence for one in judge_run(totals(causes=causes)).findings if one.code == "busy_machine"
-    ]
+    causes = Causes(5, 10, 100_000_000, (replace(STOLEN, cycles=cycles), OTHER), throttled=4)
+    findings = judge_run(totals(causes=causes)).findings
+    machine = [one.sentence for one in findings if one.code == "busy_machine"]
     assert len(machine) == named
     assert all("host of the virtual machine took 70.00 ms of 100.00 ms" in one for one in machine)
     assert all("heat throttled the processor for 4 seconds" in one for one in machine)
 
 
-def test_the_table_has_the_causes_and_their_shares() -> None:
-    table = causes_table(Causes(5, 10, 100_000_000, (cause("controller", "left_arm"), OTHER)))
+def test_table_has_the_causes_and_their_shares() -> None:
+    table = causes_table(Causes(5, 10, 100_000_000, (ARM, OTHER)))
     assert table.title == "Causes: 5 cycles woke late, 10 cycles took too long; total excess 100.00 ms"
-    assert [cell.text for cell in table.rows[0]] == [
-        "controller",
-        "left_arm",
-        "10",
-        "70.00 ms",
-        "70.0%",
-        "9000 us",
-    ]
+    row = ["controller", "left_arm", "10", "70.00 ms", "70.0%", "9000 us"]
+    assert [cell.text for cell in table.rows[0]] == row
     assert causes_table(Causes()).rows == ()
-
-
-def test_a_cause_in_a_sentence_has_its_subject_and_what_the_machine_did_is_the_cause() -> None:
-    shares = (
-        CauseShare("machine", STEAL, 5.0),
-        CauseShare("controller", "arm", 4.0),
-        CauseShare("own work", "", 1.0),
-    )
-    assert [share.label for share in shares] == [
-        "host of the virtual machine",
-        "controller of arm",
-        "own work",
-    ]
+    shares = ("machine", STEAL), ("controller", "arm"), ("own work", "")
+    labels = [CauseShare(kind, subject, 1.0).label for kind, subject in shares]
+    assert labels == ["host of the virtual machine", "controller of arm", "own work"]
