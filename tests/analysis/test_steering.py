@@ -6,16 +6,13 @@ import io
 from dataclasses import replace
 from pathlib import Path
 
-import msgspec
-import numpy as np
 import pytest
 from rich.console import Console
-from tests.kit.stories import Asked, Clients
+from tests.kit.stories import Asked, ask, rate, send, switch, tell
 
 from dxlrun.channels.commands import CommandMessage
 from dxlrun.log.log_reader import Log, read_log
 from dxlrun.output.terminal import show_parts
-from dxlrun.testing import simulated_robot
 from dxlrun_analysis.cycles.punctuality import cycle_periods_ns
 from dxlrun_analysis.parts.part import Report
 from dxlrun_analysis.report import analyze, parts, tables
@@ -34,34 +31,24 @@ controllers:
   head: {type: joint_group_position_controller, joints: [pan, tilt]}
   tail: {type: joint_group_position_controller, joints: [tilt], active: false}
 """
-
-
-def ask(kind: str, **data: object) -> CommandMessage:
-    return CommandMessage(0, "", kind, msgspec.json.encode(data) if data else b"", "anna")
-
-
-def send(*numbers: float, lease_ns: int = 0, controller: str = "head") -> CommandMessage:
-    return CommandMessage(0, controller, "positions", np.array(numbers).tobytes(), "bob", lease_ns)
-
-
+INACTIVE = "head is not active; switch to it first"
+STREAMED = send("head", "positions", 0.1, 0.1, lease_ns=50 * MS)
+HAND_OVER = switch(["tail"], ["head"])
 ASKED: Asked = {
-    5: [ask("rate", rate=100)],
+    5: [rate(100)],
     15: [ask("pause"), ask("pause")],
-    25: [ask("rate", rate=50)],
+    25: [rate(50)],
     30: [ask("resume")],
-    **{cycle: [send(0.1, 0.1, lease_ns=50 * MS)] for cycle in range(31, 39)},
-    50: [ask("switch", activate=["tail"], deactivate=["head"]), send(0.2, 0.2, lease_ns=50 * MS)],
-    51: [send(0.2, 0.2, lease_ns=50 * MS), send(0.1, controller="tail")],
+    **{cycle: [STREAMED] for cycle in range(31, 39)},
+    50: [HAND_OVER, STREAMED],
+    51: [STREAMED, send("tail", "positions", 0.1)],
     55: [CommandMessage(0, "", "load", b'{"name":', "mallory"), ask("stop")],
 }
 
 
 def run(directory: Path, asked: Asked) -> Log:
     (directory / "pair.yaml").write_text(ROBOT)
-    robot = simulated_robot(directory / "pair.yaml", duration_s=2.0, log=directory / "run.mcap")
-    Clients(robot, asked)
-    robot.run()
-    return read_log(directory / "run.mcap")
+    return read_log(tell(directory / "pair.yaml", asked, directory / "run.mcap", seconds=2.0))
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +61,7 @@ def report(log: Log) -> Report:
     return analyze(log)
 
 
-def test_the_periods_are_those_of_each_cycle(log: Log, report: Report) -> None:
+def test_periods_are_those_of_each_cycle(log: Log, report: Report) -> None:
     expected = [20 * MS] * 5 + [10 * MS] * 20 + [20 * MS] * 31
     assert cycle_periods_ns(log).tolist() == expected
     account = report.totals.periods
@@ -84,7 +71,7 @@ def test_the_periods_are_those_of_each_cycle(log: Log, report: Report) -> None:
     assert account.rates_hz == (50.0, 100.0)
 
 
-def test_the_verdict_has_it(report: Report) -> None:
+def test_verdict_has_it(report: Report) -> None:
     robot, loop, steered, *_ = report.verdict.sentences
     assert robot.startswith("Good: moved by clients within ")
     assert loop == "The loop kept 50 Hz and 100 Hz: 0 of 56 periods skipped, on virtual time."
@@ -102,7 +89,7 @@ def test_tables_and_numbers_keep_their_orders(report: Report) -> None:
     assert numbers == ["periods", "steps", "servos", "buses", "joints", "events", "steering"]
 
 
-def test_the_table_has_each_request_with_its_origin(report: Report) -> None:
+def test_table_has_each_request_with_its_origin(report: Report) -> None:
     rows = [[cell.text for cell in row[1:]] for row in tables(report)["steering"].rows]
     assert rows == [
         ["5", "rate 100 Hz", "anna", "done"],
@@ -110,28 +97,23 @@ def test_the_table_has_each_request_with_its_origin(report: Report) -> None:
         ["15", "pause", "anna", "refused: the loop is paused already"],
         ["25", "rate 50 Hz", "anna", "done"],
         ["30", "resume", "anna", "done"],
-        ["31", "stream of positions for head, 8 set-points, lease 50 ms", "bob", "done"],
+        ["31", "stream of positions for head, 8 set-points, lease 50 ms", "anna", "done"],
         ["50", "switch activate tail; deactivate head", "anna", "done"],
-        [
-            "50",
-            "stream of positions for head, 2 set-points, lease 50 ms",
-            "bob",
-            "refused: head is not active; switch to it first",
-        ],
-        ["51", "positions for tail", "bob", "done"],
+        ["50", "stream of positions for head, 2 set-points, lease 50 ms", "anna", f"refused: {INACTIVE}"],
+        ["51", "positions for tail", "anna", "done"],
         ["55", 'load {"name":', "mallory", rows[-2][-1]],
         ["55", "stop", "anna", "done"],
     ]
     assert report.totals.acts[1].time_s == pytest.approx(0.2)
 
 
-def test_a_pause_is_counted_in_periods_and_in_seconds(report: Report) -> None:
+def test_pause_is_counted_in_periods_and_in_seconds(report: Report) -> None:
     (pause,) = report.totals.pauses
     assert (pause.begin_s, pause.end_s) == pytest.approx((0.2, 0.4))
     assert pause.periods == 15
-    console = Console(file=io.StringIO(), width=160)
-    show_parts(*parts(report), console=console)
-    shown = console.file.getvalue()  # type: ignore[attr-defined]  # a StringIO, given above
+    file = io.StringIO()
+    show_parts(*parts(report), console=Console(file=file, width=160))
+    shown = file.getvalue()
     assert "periods paused" in shown
     assert "pair, 50 Hz and 100 Hz, 0.9 s" in shown
     assert "switch activate tail; deactivate head" in shown
@@ -141,17 +123,14 @@ def test_a_pause_is_counted_in_periods_and_in_seconds(report: Report) -> None:
     ("later", "ends"),
     [
         ({}, "; the lease of the stream for head expired at 0.4 s, and its joints were held"),
-        ({25: [send(0.2, 0.2)]}, ""),
-        (
-            {25: [ask("switch", activate=["tail"], deactivate=["head"])]},
-            "; the lease of the stream for head expired at 0.4 s",
-        ),
-        ({cycle: [send(0.1, 0.1, lease_ns=50 * MS)] for cycle in range(18, 100)}, ""),
+        ({25: [send("head", "positions", 0.2, 0.2)]}, ""),
+        ({25: [HAND_OVER]}, "; the lease of the stream for head expired at 0.4 s"),
+        ({cycle: [STREAMED] for cycle in range(18, 100)}, ""),
     ],
     ids=["held", "asked again", "handed over", "to the end"],
 )
-def test_a_stream_that_ended_by_its_lease_is_told(tmp_path: Path, later: Asked, ends: str) -> None:
-    stream = {cycle: [send(0.1, 0.1, lease_ns=50 * MS)] for cycle in range(5, 18)}
+def test_stream_that_ended_by_its_lease_is_told(tmp_path: Path, later: Asked, ends: str) -> None:
+    stream = {cycle: [STREAMED] for cycle in range(5, 18)}
     report = analyze(run(tmp_path, {**stream, **later}))
     (steered,) = (one for one in report.verdict.findings if one.code == "steered")
     assert steered.remedy == ""
@@ -161,25 +140,26 @@ def test_a_stream_that_ended_by_its_lease_is_told(tmp_path: Path, later: Asked, 
     assert (report.verdict.findings[1] == steered) is ends.endswith("its joints were held")
 
 
-def test_a_cycle_is_measured_by_its_own_period(tmp_path: Path) -> None:
-    asked = {5: [ask("rate", rate=200)], 60: [ask("rate", rate=25)]}
-    log = run(tmp_path, asked)
+def test_cycle_is_measured_by_its_own_period(tmp_path: Path) -> None:
+    log = run(tmp_path, {5: [rate(200)], 60: [rate(25)]})
     whole = log.cycles["written_ns"] - log.cycles["woken_ns"]
     stretched = log.cycles.copy()
-    late = 30
-    stretched["written_ns"][late] += 8 * MS - whole[late]
+    stretched["written_ns"][30] += 8 * MS - whole[30]
     stretched["written_ns"][70] += 16 * MS
     report = analyze(replace(log, cycles=stretched))
     sentence = next(one for one in report.verdict.sentences if one.startswith("The loop kept"))
     assert sentence.endswith("; a cycle took up to 8000 us, its write 7400 us: own work.")
 
 
-def test_a_pause_that_the_run_ends_in_lasts_to_the_end(tmp_path: Path) -> None:
+def test_pause_that_the_run_ends_in_lasts_to_the_end(tmp_path: Path) -> None:
     (pause,) = analyze(run(tmp_path, {10: [ask("pause")], 20: [ask("stop")]})).totals.pauses
     assert pause.periods == 11
+    without = analyze(run(tmp_path, {20: []}))
+    assert (without.totals.acts, without.totals.pauses) == ((), ())
+    assert not any("steered" in sentence for sentence in without.verdict.sentences)
 
 
-def test_the_page_shows_it(log: Log, report: Report) -> None:
+def test_page_shows_it(log: Log, report: Report) -> None:
     from dxlrun_analysis.page.report_page import analyzed_page
 
     _, text = analyzed_page(log)
@@ -187,10 +167,3 @@ def test_the_page_shows_it(log: Log, report: Report) -> None:
     assert "switch activate tail; deactivate head" in text
     assert "Shaded: the loop was paused. Dotted lines: controllers, rate or policy were changed." in text
     assert text.count('"BoxAnnotation"') >= 4  # and those that tools draw with
-
-
-def test_a_run_without_commands_has_no_steering(tmp_path: Path) -> None:
-    log = run(tmp_path, {20: []})
-    report = analyze(log)
-    assert (report.totals.acts, report.totals.pauses) == ((), ())
-    assert not any("steered" in sentence for sentence in report.verdict.sentences)
