@@ -115,6 +115,7 @@ def test_voltages_that_differ_accuse_nothing(case: str) -> None:
     ("heat", "words"),
     [
         (200.0, "impossible temperatures, from 30 to 200 deg C"),
+        (-95.0, "impossible temperatures, from -95 to 30 deg C"),
         (75.0, "was hot, at 75 deg C with a limit of 80 deg C"),
     ],
 )
