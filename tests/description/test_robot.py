@@ -30,23 +30,6 @@ def test_a_robot_file_becomes_si_units() -> None:
     assert robot.controllers["broadcaster"].rate == 25.0
 
 
-def test_what_simulated_servos_are_like_becomes_si_units() -> None:
-    text = TORSO.replace(
-        "direction: 1}",
-        "direction: 1, simulation: {inertia: 5 kg cm^2, gravity: 300 mNm, gravity_angle: -90 deg}}",
-        1,
-    ).replace(
-        "adapter: {latency: 1 ms}", "simulation: {latency_timer: 4 ms, split: byte, echo: true, absent: slot}"
-    )
-    robot = desk.robot(text + "simulation: {physics: mujoco}\n").robot
-    moved = robot.joints["elbow"].simulation
-    assert (moved.inertia, moved.friction, moved.gravity) == (pytest.approx(5e-4), None, pytest.approx(0.3))
-    assert moved.gravity_angle == pytest.approx(-math.pi / 2)
-    bus = robot.buses["main"].simulation
-    assert (bus.latency_timer, bus.split, bus.echo, bus.absent) == (4_000_000, "byte", True, "slot")
-    assert robot.simulation.physics == "mujoco"
-
-
 def test_what_is_left_out_has_its_default() -> None:
     robot = desk.robot(
         "name: x\nbuses: {m: {port: sim, protocol: 1, baud_rate: 57600}}\nloop: {rate: 50}\n"

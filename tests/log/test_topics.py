@@ -22,7 +22,7 @@ from dxlrun.channels.topic_messages import MessageRing, PublishedTopic
 from dxlrun.log import schemas
 from dxlrun.log.log_reader import open_log, read_log
 from dxlrun.log.log_writer import LogWriter
-from dxlrun.log.packing.diagnostics import DIAGNOSTICS_NS, Diagnostics
+from dxlrun.log.packing.diagnostics import Diagnostics
 from dxlrun.messages import Header, Odometry
 from dxlrun.messages.cdr import Codec
 from dxlrun.messages.declared import declared_message
@@ -183,10 +183,9 @@ def test_each_joint_has_the_status_of_its_servo_once_a_second() -> None:
     row = np.frombuffer(bytes(record.raw), dtype=record.layout.dtype)[0]
     diagnostics = Diagnostics(("elbow", "wheel", "head"))
     packed = {
-        t_ns: diagnostics.pack_diagnostics(row, t_ns, (7, 8))
-        for t_ns in range(0, 5 * DIAGNOSTICS_NS, DIAGNOSTICS_NS // 50)
+        t_ns: diagnostics.pack_diagnostics(row, t_ns, (7, 8)) for t_ns in range(0, 5 * 10**9, PERIOD_NS)
     }
-    assert [t_ns for t_ns, data in packed.items() if data] == [s * DIAGNOSTICS_NS for s in range(5)]
+    assert [t_ns for t_ns, data in packed.items() if data] == [s * 10**9 for s in range(5)]
     message: Any = Codec(schemas.DIAGNOSTICS).unpack(packed[0] or b"")
     assert message["header"]["stamp"] == {"sec": 7, "nanosec": 8}
     found = [
