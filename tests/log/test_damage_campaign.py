@@ -10,6 +10,7 @@ What is not hit is read: each whole chunk before a cut, every chunk but the one 
 from __future__ import annotations
 
 import random
+import re
 import signal
 import subprocess
 import sys
@@ -70,11 +71,9 @@ def written(tmp_path: Path, header: LogHeader, cycle: Callable[[int], bytes]) ->
         if number % CYCLES == CYCLES - 1:
             log.finish_chunk()
     log.close()
-    ends = []
     with path.open("rb") as stream:
-        for record in StreamReader(stream, emit_chunks=True).records:
-            if isinstance(record, Chunk):
-                ends.append(stream.tell())
+        records = StreamReader(stream, emit_chunks=True).records
+        ends = [stream.tell() for record in records if isinstance(record, Chunk)]
     assert len(ends) == CHUNKS
     return Written(path.read_bytes(), tuple(ends), tuple(cycles))
 
@@ -89,25 +88,20 @@ def most_memory() -> Iterator[Callable[[], int]]:
 def read(path: Path, data: bytes) -> tuple[list[bytes], list[bytes], LogReader] | None:
     """Read all that can be; None: refused with one sentence."""
     path.write_bytes(data)
+    refusal, parts = "", None
     try:
         reader = open_log(path)
-        cycles: list[bytes] = []
-        packets: list[bytes] = []
-        for part in reader.slices():
-            cycles += [row.tobytes() for row in part.cycles]
-            packets += [packet.data for packet in part.packets]
+        parts = [*reader.slices()]
         assert isinstance(reader.damage, tuple)
         assert reader.topics is not None
-        try:
-            reader.columns("/cycle", "cycle", "position")
-        except LogError as error:
-            assert str(error).startswith(f"{path}: ")  # noqa: PT017  the log itself was read
+        reader.columns("/cycle", "cycle", "position")
     except LogError as error:
-        text = str(error)
-        assert text.startswith(f"{path}: ")
-        assert "\n" not in text
+        refusal = str(error)
+    assert re.fullmatch(f"({path}: .+)?", refusal)
+    if parts is None:
         return None
-    return cycles, packets, reader
+    cycles = [row.tobytes() for part in parts for row in part.cycles]
+    return cycles, [packet.data for part in parts for packet in part.packets], reader
 
 
 @campaign(ci=100, night=2000, release=EVERY_BYTE)
@@ -133,20 +127,16 @@ def test_a_log_that_is_cut_at_any_byte_is_read_up_to_its_last_whole_chunk(
 def test_a_flipped_bit_costs_one_chunk_at_most(
     written: Written, tmp_path: Path, most_memory: Callable[[], int], amount: float, chance: random.Random
 ) -> None:
-    refused = lost = 0
-    count = int(amount)
-    for _ in range(count):
+    for _ in range(int(amount)):
         at = chance.randrange(len(written.data))
         data = bytearray(written.data)
         data[at] ^= 1 << chance.randrange(8)
         found = read(tmp_path / "flipped.mcap", bytes(data))
         if found is None:
-            refused += 1
             assert at < written.ends[0], at
             continue
         cycles, _, reader = found
         missing = len(written.cycles) - len(cycles)
-        lost += missing
         assert set(cycles) <= set(written.cycles), at
         assert missing in (0, CYCLES), (at, reader.damage)
         if missing:
@@ -154,7 +144,6 @@ def test_a_flipped_bit_costs_one_chunk_at_most(
             assert hit == written.chunk_of(at), (at, hit)
             assert reader.damage
     assert most_memory() < MOST_MEMORY
-    print(f"{count} flips: {refused} refused, {lost} cycles lost of {count * len(written.cycles)}")
 
 
 @pytest.mark.parametrize("opcode", [2, 7, 14, 0x46, 0])
