@@ -83,9 +83,11 @@ def test_a_gear_of_four_holds_four_times_the_weight():
     assert held.angle[0] < 0.3 + math.tau - 0.1
 
 
-def test_a_weight_on_a_slide_pulls_everywhere_alike():
+@pytest.mark.parametrize("coupled", [True, False])
+def test_a_weight_on_a_slide_pulls_everywhere_alike(coupled):
+    load = Load(0.01, steady=0.2)
     for angle in (0.0, 1.0, 50.0):
-        slide = single(Load(0.01, steady=0.2), angle)
+        slide = plant(alone(1.0, load), angles=[angle]) if coupled else single(load, angle)
         run(slide, 0.2, drive=0.2)
         assert slide.angle[0] == pytest.approx(angle)
         run(slide, 0.1, drive=0.0)
