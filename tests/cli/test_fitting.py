@@ -27,77 +27,58 @@ SERVOS = Table.from_rows(
         (2, Cell("AX-12A", "error"), None, 24, None),
     ],
 )
+SHOWN = {
+    80: """\
+ID  model       return delay  firmware  remark
+----
+ 1  XM430-W350        500 us        52  its supply is a little low
+ 2  AX-12A                          24""",
+    58: """\
+              return
+ID model       delay firmware remark
+----
+ 1 XM430-W350 500 us       52 its supply is a little low
+ 2 AX-12A                  24""",
+    49: """\
+              return
+ID model       delay remark
+----
+ 1 XM430-W350 500 us its supply is a little low
+ 2 AX-12A""",
+    30: """\
+ID 1: model XM430-W350,
+  return delay 500 us,
+  firmware 52, remark its
+  supply is a little low
+ID 2: model AX-12A, firmware
+  24""",
+}
+"""The table at each width; ---- is a drawn line"""
 
 
-def shown(*parts: Table | Sentence | str, width: int, terminal: bool = False) -> str:
-    console = Console(
-        file=io.StringIO(),
-        width=width,
-        force_terminal=terminal,
-        color_system="standard" if terminal else None,
-    )
+def shown(*parts: Table | Graph | Sentence | str, width: int, terminal: bool = False) -> str:
+    file, colours = io.StringIO(), "standard" if terminal else None
+    console = Console(file=file, width=width, force_terminal=terminal, color_system=colours)  # type: ignore[arg-type]
     show_parts(*parts, console=console)
-    text: str = console.file.getvalue()  # type: ignore[attr-defined]  # a StringIO, given above
-    return "\n".join(line.rstrip() for line in text.splitlines())
+    return "\n".join(line.rstrip() for line in file.getvalue().splitlines())
 
 
-@pytest.mark.parametrize(
-    ("width", "expected"),
-    [
-        (
-            80,
-            "ID  model       return delay  firmware  remark\n"
-            "----\n"
-            " 1  XM430-W350        500 us        52  its supply is a little low\n"
-            " 2  AX-12A                          24",
-        ),
-        (
-            58,
-            "              return\n"
-            "ID model       delay firmware remark\n"
-            "----\n"
-            " 1 XM430-W350 500 us       52 its supply is a little low\n"
-            " 2 AX-12A                  24",
-        ),
-        (
-            49,
-            "              return\n"
-            "ID model       delay remark\n"
-            "----\n"
-            " 1 XM430-W350 500 us its supply is a little low\n"
-            " 2 AX-12A",
-        ),
-        (
-            30,
-            "ID 1: model XM430-W350,\n"
-            "  return delay 500 us,\n"
-            "  firmware 52, remark its\n"
-            "  supply is a little low\n"
-            "ID 2: model AX-12A, firmware\n"
-            "  24",
-        ),
-    ],
-)
-def test_a_table_that_does_not_fit_becomes_paragraphs_in_which_nothing_is_cut(
-    width: int, expected: str
-) -> None:
-    lines = shown(SERVOS, width=width).splitlines()
+@pytest.mark.parametrize("width", SHOWN)
+def test_table_that_does_not_fit_becomes_paragraphs_in_which_nothing_is_cut(width: int) -> None:
     rule = {"\N{BOX DRAWINGS LIGHT HORIZONTAL}", " "}
-    ruled = ["----" if set(line) <= rule else line for line in lines]
-    assert "\n".join(ruled) == expected
+    lines = ["----" if set(line) <= rule else line for line in shown(SERVOS, width=width).splitlines()]
+    assert "\n".join(lines) == SHOWN[width]
 
 
-def test_a_long_text_is_folded_between_words() -> None:
-    table = Table.from_rows(
-        "Events", [Column("event", "name"), Column("text", "text")], [("SETUP", "word " * 20)]
-    )
-    lines = shown(table, width=50).splitlines()
+def test_long_text_is_folded_between_words() -> None:
+    columns = [Column("event", "name"), Column("text", "text")]
+    lines = shown(Table.from_rows("Events", columns, [("SETUP", "word " * 20)]), width=50).splitlines()
     assert lines[:2] == ["", "Events"]
     assert max(map(len, lines)) <= 50
     assert " ".join(lines).split().count("word") == 20
 
 
-def test_a_row_needs_a_value_for_each_column() -> None:
+def test_row_needs_a_value_for_each_column() -> None:
     with pytest.raises(ValueError, match="zip"):
         Table.from_rows("", [Column("ID"), Column("model")], [(1,)])
 
@@ -111,12 +92,10 @@ HOSTILE = "\x1b]0;owned\x07\x1b[2J \x9b31m \u202egood\u202c \r\b \x7f \ud800"
 
 
 def test_texts_of_plug_ins_have_no_effect_on_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
-    table = Table.from_rows(
-        HOSTILE, [Column(HOSTILE, "name"), Column("b", "text")], [(HOSTILE, HOSTILE), ("a", "b")]
-    )
-    graph = Graph(HOSTILE, (Node("a", "controller", (HOSTILE,)),), ())
+    columns = [Column(HOSTILE, "name"), Column("b", "text")]
+    table = Table.from_rows(HOSTILE, columns, [(HOSTILE, HOSTILE), ("a", "b")])
     texts = [shown(table, HOSTILE, Sentence(HOSTILE), width=width) for width in (40, 80, 200)]
-    texts.append(shown(graph, width=200))  # type: ignore[arg-type]  # a part like the others
+    texts.append(shown(Graph(HOSTILE, (Node("a", "controller", (HOSTILE,)),), ()), width=200))
     print_error(HOSTILE)
     print_warning(HOSTILE)
     show_json({HOSTILE: HOSTILE}, code=1, errors=[HOSTILE])

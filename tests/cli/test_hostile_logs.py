@@ -35,54 +35,46 @@ class Still(JointController):
         return self.start + self.offset
 """
 ATTACK = "\nPath('executed').write_text('')\n"
-FOREIGN = "a_word_of_nobody_else: 1\n"
-READERS = (
-    ["analyze", "bad.mcap"],
-    ["analyze", "bad.mcap", "--json"],
-    ["analyze", "bad.mcap", "--report", "page.html"],
-    ["logs", "."],
-    ["export", "bad.mcap", "rows.csv", "--format", "csv"],
-    ["export", "bad.mcap", "tables", "--format", "parquet"],
-    ["convert", "bad.mcap", "motion.yaml"],
-)
-REPLAYS = (
-    ["replay", "bad.mcap"],
-    ["replay", "bad.mcap", "--code", "current"],
-    ["replay", "bad.mcap", "--set", "head.offset=0.1"],
-    ["replay", "bad.mcap", "x:=1"],
-)
-
-
-def _included(name: str, text: str) -> Callable[[Any], None]:
-    def edit(content: Any) -> None:
-        content["included"][name] = text
-
-    return edit
-
-
-def _robot_text(old: str, new: str) -> Callable[[Any], None]:
-    def edit(content: Any) -> None:
-        assert old in content["source_text"]
-        content["source_text"] = content["source_text"].replace(old, new)
-
-    return edit
-
-
-HOSTILE: dict[str, Callable[[Path], Callable[[Any], None]]] = {
-    "other code": lambda outside: _included("still.py", STILL + ATTACK),
-    "code above the folder": lambda outside: _included("../" * 9 + "above.py", ATTACK),
-    "code at a place of its own": lambda outside: _included(str(outside / "new.py"), ATTACK),
-    "code that is not used": lambda outside: _included("more.py", ATTACK),
-    "a file of another folder": lambda outside: _robot_text(
-        "name: short", f"include: [{outside}/foreign.yaml]\nname: short"
-    ),
-    "a URDF of another folder": lambda outside: _robot_text(
-        "name: short", f"model: {{urdf: {outside}/foreign.yaml}}\nname: short"
-    ),
-    "a motor of another folder": lambda outside: _robot_text(
-        "{id: 1}", f"{{id: 1, motor: {outside}/foreign.yaml}}"
-    ),
+READERS = """\
+analyze bad.mcap
+analyze bad.mcap --json
+analyze bad.mcap --report page.html
+logs .
+export bad.mcap rows.csv --format csv
+export bad.mcap tables --format parquet
+convert bad.mcap motion.yaml"""
+REPLAYS = """\
+replay bad.mcap
+replay bad.mcap --code current
+replay bad.mcap --set head.offset=0.1
+replay bad.mcap x:=1"""
+CODE = {
+    "other code": ("still.py", STILL + ATTACK),
+    "code above the folder": ("../" * 9 + "above.py", ATTACK),
+    "code at a place of its own": ("OUTSIDE/new.py", ATTACK),
+    "code that is not used": ("more.py", ATTACK),
 }
+"""Names and texts of files that a log claims to have"""
+TEXTS = {
+    "a file of another folder": ("name: short", "include: [OUTSIDE/foreign.yaml]\nname: short"),
+    "a URDF of another folder": ("name: short", "model: {urdf: OUTSIDE/foreign.yaml}\nname: short"),
+    "a motor of another folder": ("{id: 1}", "{id: 1, motor: OUTSIDE/foreign.yaml}"),
+}
+"""Changes of the robot file in a log"""
+
+
+def edit(attack: str, outside: Path) -> Callable[[Any], None]:
+    """Return what makes the plan in a log hostile."""
+    old, new = (word.replace("OUTSIDE", str(outside)) for word in (CODE | TEXTS)[attack])
+
+    def change(content: Any) -> None:
+        if attack in CODE:
+            content["included"][old] = new
+        else:
+            assert old in content["source_text"]
+            content["source_text"] = content["source_text"].replace(old, new)
+
+    return change
 
 
 @pytest.fixture(scope="module")
@@ -94,7 +86,7 @@ def honest(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("attack", HOSTILE)
+@pytest.mark.parametrize("attack", [*CODE, *TEXTS])
 def test_no_verb_executes_a_log_or_leaves_its_folder(
     honest: Path,
     tmp_path: Path,
@@ -105,29 +97,28 @@ def test_no_verb_executes_a_log_or_leaves_its_folder(
     outside, work = tmp_path / "outside", tmp_path / "work"
     outside.mkdir()
     work.mkdir()
-    (outside / "foreign.yaml").write_text(FOREIGN)
+    (outside / "foreign.yaml").write_text("a_word_of_nobody_else: 1\n")
     for name in ("still.py", "good.yaml"):
         (work / name).write_text((honest / name).read_text())
     monkeypatch.chdir(work)
-    written_anew(honest / "run.mcap", work / "bad.mcap", plan(HOSTILE[attack](outside)))
-    before = sorted(tmp_path.rglob("*"))
-    for words in (*READERS, *REPLAYS) if attack == "other code" else REPLAYS:
-        code = main(words)
+    written_anew(honest / "run.mcap", work / "bad.mcap", plan(edit(attack, outside)))
+    before = set(tmp_path.rglob("*"))
+    for line in (READERS * (attack == "other code") + "\n" + REPLAYS).strip().splitlines():
+        code = main(line.split())
         said = "".join(capfd.readouterr())
-        assert code in {0, 1, 2}, (words, said)
-        assert "Traceback" not in said, (words, said)
-        assert "a_word_of_nobody_else" not in said, (words, said)
-        assert not (work / "executed").exists(), (words, said)
-    made = set(tmp_path.rglob("*")) - set(before)
-    assert all(path.is_relative_to(work) for path in made)
+        assert code in {0, 1, 2}, (line, said)
+        assert "Traceback" not in said, (line, said)
+        assert "a_word_of_nobody_else" not in said, (line, said)
+        assert not (work / "executed").exists(), (line, said)
+    assert all(path.is_relative_to(work) for path in set(tmp_path.rglob("*")) - before)
     assert sorted(path.name for path in outside.iterdir()) == ["foreign.yaml"]
 
 
-def test_the_same_log_is_executed_when_it_is_trusted(
+def test_same_log_is_executed_when_it_is_trusted(
     honest: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    written_anew(honest / "run.mcap", Path("bad.mcap"), plan(_included("still.py", STILL + ATTACK)))
+    written_anew(honest / "run.mcap", Path("bad.mcap"), plan(edit("other code", tmp_path)))
     assert main(["replay", "bad.mcap", "--json"]) == 2
     assert "--code log" in json.dumps(json.loads(capfd.readouterr().out))
     assert not Path("executed").exists()
