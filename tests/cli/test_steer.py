@@ -12,11 +12,12 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
+from tests.kit import commands
 from tests.kit.answers import read_answer, result_of
 from tests.kit.awaited import DEADLINE_S, until
+from tests.kit.commands import Case, cases, play
 from tests.kit.pages import page_text
 
 from dxlrun import DxlrunError, GoalState, GoalTimeout, RemoteRobot, connect, running
@@ -166,31 +167,12 @@ def test_a_robot_that_has_ended_is_an_error(
 # Steering
 
 
-def cases() -> Iterator[Any]:
-    """Yield the stories of `steered.txt`: lines of words, each with the lines that are printed."""
-    for block in (Path(__file__).parent / "steered.txt").read_text("utf-8").strip().split("\n\n"):
-        title, *lines = block.split("\n")
-        typed: list[tuple[str, list[str]]] = []
-        for line in lines:
-            if line.startswith("  "):
-                typed[-1][1].append(line.strip())
-            else:
-                typed.append((line, []))
-        yield pytest.param(typed, id=title)
-
-
-@pytest.mark.parametrize("typed", [*cases()])
-def test_what_is_typed_is_answered(dxlrun, torso: RemoteRobot, typed: list[tuple[str, list[str]]]) -> None:
-    """A line that begins with an exit code is an error; `...` is any text, of whole lines at the end."""
-    assert typed
-    for words, lines in typed:
-        said = dxlrun(*shlex.split(words))
-        code = int(lines[0][0]) if lines[0][0] in "12" else 0
-        wanted = "dxlrun: " + lines[0][2:] if code else "\n".join(lines)
-        pattern = ".*".join(re.escape(part) for part in wanted.split("..."))
-        shown = (said.err if code else said.out).rstrip("\n")
-        assert (said.code, bool(said.err)) == (code, code > 0), (words, said)
-        assert re.fullmatch(pattern, shown, re.DOTALL), (words, shown, wanted)
+@pytest.mark.parametrize("case", cases("steered.txt"))
+def test_what_is_typed_is_answered(
+    dxlrun, torso: RemoteRobot, case: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    play(case, dxlrun, commands.Stage())
 
 
 def test_commands_leave_joints_and_registers_as_they_say(dxlrun, torso: RemoteRobot) -> None:
