@@ -116,12 +116,6 @@ def test_a_reference_that_none_or_two_of_those_below_export_cannot_be_commanded(
         robot.build()
 
 
-def test_two_controllers_cannot_command_one_reference(robot):
-    robot.script("lower", **LOWER).script("first", **UPPER).script("second", joints=("j1",), **UPPER)
-    with pytest.raises(ControllerFault, match="first and second both command lower/j1/position"):
-        robot.build()
-
-
 def test_a_slower_controller_above_leaves_its_reference_in_between(robot):
     counts = on_update(lambda context, time_ns, _: context.commands.position.fill(time_ns / PERIOD_NS / 100))
     robot.script("lower", following, **LOWER).script("upper", counts, every=3, **UPPER).run(6)

@@ -277,21 +277,6 @@ def test_only_the_last_results_are_kept_and_memory_stays_flat(story):
     assert abs(marks[1] - marks[0]) < 2 * KEPT, "less than half an object a goal"
 
 
-@pytest.mark.parametrize(("torque", "outcome"), [(Torque.ON, "missed"), (Torque.OFF, "aborted")])
-def test_a_goal_that_a_limp_joint_misses_is_aborted_because_of_it(torque, outcome):
-    seen = []
-    record = CycleRecord(CycleLayout(("j0",), ("arm",)))
-    record.states.torque[:], record.states.valid[:] = torque, True
-    events = type("Events", (), {"emit_event": lambda self, *event: seen.append(event)})()
-    joints = (JointPlan("j0", -1.0, 1.0, None),)
-    goal = GoalRegistry(record, events, joints, lambda controller: CurrentCommands(("j0",))).accept_goal(
-        "arm", "move", "anna"
-    )
-    goal.end(Outcome.MISSED, "", "j0", 0.2)
-    assert goal.outcome == outcome
-    assert ("j0 is limp" in seen[-1][1].text) is (outcome == "aborted")
-
-
 # Live parameters
 
 

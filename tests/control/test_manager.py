@@ -7,7 +7,6 @@ import pytest
 from tests.kit.loops import PERIOD_NS, Robot, Scripted, commanding, on_update
 
 from dxlrun.channels.event_records import EventCode
-from dxlrun.control.controllers.claims import Conflict, conflicts
 from dxlrun.control.controllers.managed import TRANSITIONS, ControllerEvent, State
 from dxlrun.errors import ControllerFault, PlugInError
 
@@ -26,36 +25,11 @@ def test_two_active_controllers_cannot_have_one_joint(robot):
         robot.build()
 
 
-def test_an_inactive_controller_and_one_that_only_looks_may_share_joints(robot):
-    robot.script("first").script("spare", active=False).script("viewer", command=()).build()
-    assert list(conflicts(robot.plan.controllers)) == [
-        Conflict(joint, "first", "spare") for joint in ("j0", "j1")
-    ]
-
-
 def test_commands_of_several_controllers_are_merged_by_joint(robot):
     robot.script("left", commanding(position=0.3, velocity=0.7), **ONE)  # the velocity is not claimed
     robot.script("right", commanding(position=0.2, velocity=0.5), joints=("j1",)).run(3)
     np.testing.assert_array_equal(last(robot, "position"), [0.3, 0.2])
     np.testing.assert_array_equal(last(robot, "velocity"), [NAN, 0.5])
-
-
-def test_a_controller_that_leaves_leaves_no_command_and_begins_without_one(robot):
-    values = {"now": 0.3}
-
-    def act(context, *_):
-        if values["now"] is not None:
-            context.commands.position[:] = values["now"]
-            context.commands.velocity[:] = 0.5
-
-    robot.script("own", on_update(act))
-    leaves = [lambda: values.update(now=None), robot.switches((), ["own"])]
-    robot.run(10, {3: leaves, 6: robot.switches(["own"])})
-    for name, value in (("position", 0.3), ("velocity", 0.5)):
-        sent = [cycle.tolist() for cycle in robot.column(name)]
-        assert sent[:3] == [[value, value]] * 3
-        assert np.isnan(sent[3:]).all()
-    assert robot.column("active") == [1] * 3 + [0] * 3 + [1] * 4
 
 
 ROWS = [(1, 0), (0,), (1, 2), (0, 4), (4, 0), (0, 2, 4), (4, 2, 0), (5, 3, 1), (0, 1, 3), (2, 5, 0, 1)]
