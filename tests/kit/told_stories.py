@@ -17,8 +17,9 @@ and after `====` cases. A case is a sentence and lines:
 Expected are each goal that ends, events (`=> event arm turns...`, source and text, or `=> no event arm ...`),
 shafts, deg from the reference, and columns of the log: `=> position elbow from 1.5 to 2: 0.29 to 0.31`, with
 `spread` before the numbers for the difference of the largest and the smallest one, and `step` for the largest
-one of neighbours. Without a time it is the last cycle. `...` stands for any text. Each run is equal to its
-replay. A case may have several runs: `NAME = a | b` lines let `NAME` stand for one text after the other.
+one of neighbours. Without a time it is the last cycle. `=> topic /pid/state: 0 to 30` is about the ms between
+its messages. `...` stands for any text. Each run is equal to its replay. `needs physics` names an extra. A
+case may have several runs: by `NAME = a | b` its `NAME` stands for one text after the other.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ from tests.kit.line_faults import turn_by_hand
 
 from dxlrun.channels.answers import Completion
 from dxlrun.channels.event_records import EventCode
-from dxlrun.log.log_reader import Log, read_log
+from dxlrun.log.log_reader import Log, open_log, read_log
 from dxlrun.testing import VirtualRobot, simulated_robot
 from dxlrun_analysis.replay import replay_log
 from dxlsim.bus.simulated_bus import SimulatedBus
@@ -163,6 +164,8 @@ class Story:
             assert all(inside), (min(found), max(found))
 
     def values(self, column: str, name: str, match: re.Match[str]) -> Any:
+        if column == "topic":
+            return np.diff(open_log(self.folder / "run.mcap").columns(name)["t_ns"]) / 1e6
         if column == "shaft":
             rows = np.degrees(np.array(self.shafts[int(name)]) - self.middle(int(name)))
             period_s = LOOK_NS * 1e-9
@@ -204,7 +207,10 @@ def stories(folder: Path) -> Iterator[Any]:
             start += block.count("\n") + 2
             (_, title), *told = [(n, line) for n, line in lines if line and line[0] != "#"]
             for name, each in variants(told):
-                yield pytest.param(path, head, each, id=f"{path.stem}: {title}{name}")
+                needed = [line.partition(" ")[2] for _, line in each if line.startswith("needs ")]
+                rest = [(number, line) for number, line in each if not line.startswith("needs ")]
+                marks = [pytest.mark.needs(one) for one in needed]
+                yield pytest.param(path, head, rest, id=f"{path.stem}: {title}{name}", marks=marks)
 
 
 def variants(told: list[tuple[int, str]]) -> Iterator[tuple[str, list[tuple[int, str]]]]:
