@@ -208,6 +208,7 @@ def check(case: Case, runs: LiveRuns, folder: Path) -> None:
 GROUPS = read_groups()
 
 
+@pytest.mark.timeout(300)  # several runs
 @pytest.mark.parametrize("name", GROUPS)
 def test_ways_out_of_a_run(name: str, live_runs: LiveRuns, tmp_path: Path) -> None:
     cases = {one.name: (one, live_runs, tmp_path / str(at)) for at, one in enumerate(GROUPS[name])}

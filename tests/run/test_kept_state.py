@@ -47,6 +47,8 @@ from dxlrun.run.kept_files import read_states, replace_file, state_directory
 from dxlrun.testing import plan_of, read_log, simulated_robot
 from dxlrun_analysis.replay import Setting, replay_log
 
+pytestmark = pytest.mark.long
+
 ROBOT = """\
 name: keeper
 arguments:

@@ -17,6 +17,8 @@ from tests.kit.stories import prepared
 from dxlrun.channels.event_records import EventCode
 from dxlrun.plan.policy_plan import SLOW_SPEED
 
+pytestmark = pytest.mark.long
+
 TICK = math.tau / 4096
 PERIOD_MS = 20
 COMMANDED_MS, FAULT_MS = 300, 1000

@@ -23,6 +23,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import pytest
 from tests.kit.awaited import DEADLINE_S, until
 from tests.kit.campaigns import campaign
 from tests.kit.live_run import DXLRUN, ROBOT, Running, Start, together
@@ -229,6 +230,7 @@ def check_pair(start: Start, folder: Path, pair: tuple[Hit, Hit], pause_s: float
         assert "was suspended (such as by Ctrl-Z)" in " ".join(err.split())
 
 
+@pytest.mark.timeout(300)  # several runs
 @campaign(ci=8, night=20, release=len(PAIRS))
 def test_one_survivor_takes_torque_off(start: Start, tmp_path: Path, amount: float) -> None:
     full = amount == len(PAIRS)

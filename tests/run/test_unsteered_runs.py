@@ -68,6 +68,7 @@ def test_stop_leaves_a_run_that_is_already_ending_its_pose(
         assert running.is_limp()
 
 
+@pytest.mark.timeout(300)  # several runs
 def test_stop_ends_the_run_that_listens_under_the_name_and_refuses_one_of_several_others(
     dxlrun: Dxlrun, start: Start, tmp_path: Path
 ) -> None:

@@ -16,6 +16,8 @@ from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.testing import plan_of, simulated_robot
 from dxlrun_analysis.joints.goal_tracking import tracking
 
+pytestmark = pytest.mark.long
+
 ROBOTS = Path(__file__).parents[2] / "robots"
 TORSO = ROBOTS / "bioloid_torso.yaml"
 THREE_PARTS = ROBOTS / "motions/three_parts.yaml"
