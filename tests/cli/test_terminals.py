@@ -79,7 +79,7 @@ def shell(line: str, directory: Path, **words: object) -> subprocess.CompletedPr
     [
         *(("check missing.yaml", 2, closed) for closed in (">&-", ">&- <&-", ALL, "2>&-", "2> /dev/full")),
         ("check {torso}", 0, ALL),
-        ("{torso} --virtual --duration 0.2 --no-record", 0, ALL),  # in real time: tests/run/test_exits.py
+        ("{torso} --virtual --duration 0.2 --no-record", 0, ALL),  # in real time: tests/run/test_run.py
     ],
 )
 def test_closed_streams_change_nothing_but_what_is_seen(
