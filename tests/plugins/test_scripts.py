@@ -32,9 +32,10 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from msgspec.structs import replace
 from tests.kit.stages import Stage
 
-from dxlrun import LINEAR, MotorModel, ServoModel
+from dxlrun import LINEAR, MotorLoad, MotorModel, ServoModel
 from dxlrun.channels.cycle import Torque
 from dxlrun_controllers.plugin import dxlrun_controllers
 
@@ -47,8 +48,12 @@ ENDED = re.compile(r"(reached|missed|aborted|cancelled|preempted) ?(.*?)(?: \((\
 TORQUES = {True: Torque.ON, "lost": Torque.LOST, "released": Torque.RELEASED}
 ROWS = ("position", "velocity", "effort", "pwm", "provided")
 UNITS = {"linear": LINEAR}
+PLAIN = MotorModel("MX-64", 12.0, 1.6, 3.6, 0.011, delay_ns=0, position_gain=0.16, p_gain=32,
+                   torque_per_effort=1.6)  # fmt: skip
 MODELS = {
     "MOTOR": MotorModel("XM430-W350", 12.0, 1.6, 4.0, 0.01, position_gain=0.005, p_gain=800),
+    "PLAIN": PLAIN,
+    "WEIGHT": replace(PLAIN, load=MotorLoad(0.0, 0.5, 0.0)),
     "XM430": ServoModel("XM430-W350", "ID 1 on bus main", "A", 4.1, 2.3, 12.0, 4.8, 80.0),
     None: None,
 }

@@ -1,4 +1,4 @@
-"""feed_forward: the inverse of the servo's model, look-ahead, references, bounds, live scale."""
+"""feed_forward: the inverse of the model of a servo, and its look-ahead; with `scripts/feed_forward.txt`."""
 
 from __future__ import annotations
 
@@ -23,7 +23,6 @@ MOTOR = MotorModel(
 )  # fmt: skip
 PLAIN = replace(MOTOR, stribeck=None, load=MotorLoad(), friction=0.0, load_friction=0.0, viscous_friction=0.0)
 PERIOD_S = 0.02
-TWO = {"joints": ["a", "b"]}
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -79,135 +78,30 @@ def test_a_late_cycle_is_counted_with_its_length() -> None:
     assert ahead.acceleration == pytest.approx(5.0)
 
 
-def started(parameters: dict[str, object] | None = None, **more: Any) -> Any:
-    motors = more.pop("motors", (PLAIN, replace(PLAIN, load=MotorLoad(0.0, 0.5, 0.0))))
-    robot = Stage(FeedForward, TWO | (parameters or {}), motors=motors, **more)
-    robot.states.velocity[:] = 0.0
-    robot.activate()
-    return robot
-
-
-def commanded(robot: Any, interface: str = "position", at_s: float = 0.0) -> np.ndarray:
-    robot.controller.update(round(at_s * 1e9), round(PERIOD_S * 1e9))
-    return getattr(robot.commands, interface).copy()
-
-
-STIFF = 0.16 * 32
-HOLD = 0.5 * math.sin(-0.2) * 3.6 / 1.6 / 12.0
-"""Duty with which b, at -0.2 rad, holds its weight"""
-
-
-def test_without_a_reference_joints_are_held_where_they_were() -> None:
-    robot = started()
-    assert commanded(robot) == pytest.approx([0.3, -0.2 + HOLD / STIFF])
-    robot.states.position[:] = 1.0
-    assert commanded(robot) == pytest.approx([0.3, -0.2 + HOLD / STIFF])
-    robot.context.references.position[:] = [0.5, np.nan]
-    robot.context.references.velocity[:] = 0.0
-    assert commanded(robot) == pytest.approx([0.5, -0.2 + HOLD / STIFF])
-    robot.context.references.position[:] = np.nan
-    robot.context.references.velocity[:] = np.nan
-    assert commanded(robot)[0] == pytest.approx(0.5)
-
-
-def test_a_joint_that_was_never_read_gets_nothing_yet() -> None:
-    robot = started(present=(np.nan, -0.2))
-    robot.states.valid[:] = [False, True]
-    assert np.isnan(commanded(robot)).tolist() == [True, False]
-    robot.states.position[0], robot.states.valid[0] = 0.1, True
-    assert commanded(robot)[0] == pytest.approx(0.1)
-    robot = started({"command_interface": "pwm"}, present=(np.nan, -0.2))
-    robot.states.valid[:] = [False, True]
-    assert commanded(robot, "pwm") == pytest.approx([0.0, HOLD])
+TWO = {"joints": ["a", "b"]}
 
 
 def test_a_constant_speed_needs_the_back_emf_and_is_met_ahead() -> None:
     motor = replace(PLAIN, delay_ns=5_000_000)
-    robot = started({"lead": "2 ms"}, motors=(motor, motor))
-    references = robot.context.references
-    references.position[:], references.velocity[:] = 0.3, 2.0
-    commanded(robot)
-    ahead = 0.002 + 0.005 + PERIOD_S / 2
+    robot = Stage(FeedForward, TWO | {"lead": "2 ms"}, motors=(motor, motor)).activate()
+    robot.context.references.position[:], robot.context.references.velocity[:] = 0.3, 2.0
+    robot.step()
+    ahead = 2.0 * (0.002 + 0.005 + PERIOD_S / 2) + 1.6 * 2.0 / 12.0 / (0.16 * 32)
     # the first update knows no acceleration, so it is that of a constant speed
-    assert robot.commands.position == pytest.approx(0.3 + 2.0 * ahead + 1.6 * 2.0 / 12.0 / STIFF)
-    robot.change(0.0, scale={"a": 0.5, "b": 0.0})
-    offset = commanded(robot) - 0.3
-    assert offset == pytest.approx([(2.0 * ahead + 1.6 * 2.0 / 12.0 / STIFF) / 2, 0.0])
-
-
-@pytest.mark.parametrize(
-    ("parameters", "interface", "most"),
-    [
-        ({"most": {"a": 0.01, "b": 0.02}}, "position", [0.01, 0.02]),
-        ({"most": 0.3, "command_interface": "pwm"}, "pwm", [0.3, 0.3]),
-        ({"command_interface": "pwm"}, "pwm", [1.0, 1.0]),
-        ({"command_interface": "effort"}, "effort", [0.7, 0.7]),
-    ],
-)
-def test_what_is_added_has_a_bound(parameters: dict[str, object], interface: str, most: list[float]) -> None:
-    robot = started(parameters, limits={"effort": 0.7})
-    references = robot.context.references
-    references.position[:], references.velocity[:] = 0.0, 0.0
-    commanded(robot)
-    for sign in (1, -1):
-        references.velocity[:] = sign * 50.0
-        assert commanded(robot, interface) == pytest.approx(sign * np.array(most))
-
-
-def test_positions_stay_within_the_limits() -> None:
-    robot = started(limits={"lower": -0.5, "upper": 0.5})
-    references = robot.context.references
-    references.position[:], references.velocity[:] = [0.499, -0.499], [3.0, -3.0]
-    assert commanded(robot).tolist() == [0.5, -0.5]
-
-
-def test_a_jump_of_the_reference_is_no_faster_than_the_joint() -> None:
-    robot = started({"scale": 1.0}, limits={"velocity": 2.0, "acceleration": 5.0}, motors=(PLAIN,) * 2)
-    robot.context.references.position[:] = 0.0
-    commanded(robot)
-    robot.context.references.position[:] = 1.0
-    needed = (0.011 * 5.0 * 3.6 / 1.6 + 1.6 * (2.0 + 5.0 * PERIOD_S / 2)) / 12.0
-    ahead = 2.0 * PERIOD_S / 2 + 5.0 * (PERIOD_S / 2) ** 2 / 2
-    assert commanded(robot) == pytest.approx(1.0 + ahead + needed / STIFF)
-
-
-def test_efforts_are_in_the_unit_of_the_servo_and_the_reference_goes_on() -> None:
-    parameters = {"command_interface": "effort", "pass_on": True}
-    robot = started(parameters, into=("pid",))
-    references = robot.context.references
-    references.position[:], references.velocity[:] = -0.2, np.nan
-    commanded(robot)
-    commands = robot.commands
-    assert commands.effort == pytest.approx([0.0, 0.5 * math.sin(-0.2) / 1.6])
-    assert (commands.position.tolist(), commands.velocity.tolist()) == ([-0.2, -0.2], [0.0, 0.0])
-
-
-def test_the_measured_voltage_counts_slowly_and_never_wildly() -> None:
-    robot = started({"voltage_filter": "180 ms", "command_interface": "pwm"})
-    voltage = robot.states.voltage
-    assert commanded(robot, "pwm")[1] == pytest.approx(HOLD)
-    voltage[:] = [np.nan, 10.0]
-    assert commanded(robot, "pwm")[1] == pytest.approx(HOLD * 12.0 / 11.8)  # a tenth of the way
-    for _ in range(200):
-        commanded(robot, "pwm")
-    assert robot.commands.pwm[1] == pytest.approx(HOLD * 12.0 / 10.0)
-    voltage[:] = 0.0
-    for _ in range(200):
-        commanded(robot, "pwm")
-    assert robot.commands.pwm[1] == pytest.approx(HOLD * 2.0)
-    voltage[:] = 11.0
-    robot.activate()
-    assert commanded(robot, "pwm")[1] == pytest.approx(HOLD * 12.0 / 11.0)
+    assert robot.commands.position == pytest.approx(0.3 + ahead)
+    robot.change(scale={"a": 0.5, "b": 0.0})
+    robot.step()
+    assert robot.commands.position - 0.3 == pytest.approx([ahead / 2, 0.0])
 
 
 def test_the_state_is_published_fifty_times_a_second() -> None:
-    robot = started()
+    robot = Stage(FeedForward, TWO, motors=(PLAIN, replace(PLAIN, load=MotorLoad(0.0, 0.5, 0.0)))).activate()
     for k in range(50):
         robot.controller.update(k * 5_000_000, 5_000_000)
     assert len(robot.messages) == 13
     topic, state = robot.messages[-1]
     assert topic == "state"
-    assert state.duty == pytest.approx([0.0, HOLD])
+    assert state.duty == pytest.approx([0.0, 0.5 * math.sin(-0.2) * 3.6 / 1.6 / 12.0])
 
 
 @pytest.mark.parametrize(
