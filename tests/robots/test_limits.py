@@ -109,18 +109,6 @@ def test_the_shaft_is_never_faster_than_the_limit(tmp_path, shaft, protocol, rat
     assert shaft.too_far(SPEED) <= 0.01
 
 
-def test_a_trajectory_of_one_point_at_time_0_does_not_move_the_shaft(tmp_path, shaft):
-    """Also where the file has no limit: the servo's top speed is one."""
-    joint = "limits: {position: [-2 rad, 2 rad]}"
-    file = robot_file(tmp_path, 50, joint, "type: joint_trajectory_controller")
-    asks = [Ask(1.5, "mover", "trajectory", {"points": [{"time": 0, "positions": [1.0]}]})]
-    run = steered(tmp_path, file, 2.5, asks, before=shaft.watch)
-    assert np.ptp(shaft.angles) < 0.01
-    (ended,) = [event.text for event in run.log.events if event.name == "goal_ended"]
-    assert "aborted: joint arm needs " in ended
-    assert " to the first point (1 in 0.02 s)" in ended
-
-
 @pytest.mark.parametrize("protocol", [1.0, 2.0])
 def test_behind_a_gear_the_joint_is_never_faster_than_its_limit(tmp_path, shaft, protocol):
     joint = f"gear_ratio: 3, limits: {{position: [-40 deg, 40 deg], velocity: {SPEED} rad/s}}"

@@ -6,6 +6,7 @@ CI has one model for each; the campaign has the others.
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from collections.abc import Sequence
@@ -258,45 +259,47 @@ def test_the_dead_band_is_margin_and_friction_over_the_gain(measures, model, fri
 # Gaps
 
 
-def deviation(model: str, gap_s: float, size: float, fastest: float, speeds_too: bool) -> float:
-    """Return by how much a motion that is sent with gaps leaves that which is sent in each cycle, rad.
+@functools.cache
+def way_of(model: str, gap_s: float, size: float, fastest: float, speeds_too: bool) -> tuple[float, ...]:
+    """Return where the shaft is in a motion that is sent with gaps, rad.
 
     In cycles of 1 / 240 s, in each of which the gate lets the goal move by `fastest` / 240.
     """
-    ways = []
-    for each in (gap_s, CYCLE_S):
-        bus = on_a_bench(model)
-        servo, began_ns, way, step, last, goal = bus.servo(1), bus.now_ns, [], 0, 0.0, 0.0
-        table = servo.registers.table
-        for number in range(round((gaps.MOTION_S + gaps.FADE_S) / CYCLE_S)):
-            if number * CYCLE_S >= step * each - 1e-9:
-                place = float(gaps.motion(np.array([step * each]), size)[0][0])
-                speed = max(1, round(abs(place - last) / each / table.rad_s_per_tick))
-                if speeds_too:
-                    write(servo, **{table.goal_speed_item: speed})
-                last, step = place, step + 1
-            goal = min(max(last, goal - fastest * CYCLE_S), goal + fastest * CYCLE_S)
-            turn_to(bus, 2.6 + goal)
-            for part in (0.0, 0.25, 0.5, 0.75):
-                bus.advance_to(began_ns + round((number + part) * CYCLE_S * 1e9))
-                if number * CYCLE_S > gaps.FADE_S:
-                    way.append(servo.shaft_angle)
-        ways.append(way)
+    bus = on_a_bench(model)
+    servo, began_ns, way, step, last, goal = bus.servo(1), bus.now_ns, [], 0, 0.0, 0.0
+    table = servo.registers.table
+    for number in range(round((gaps.MOTION_S + gaps.FADE_S) / CYCLE_S)):
+        if number * CYCLE_S >= step * gap_s - 1e-9:
+            place = float(gaps.motion(np.array([step * gap_s]), size)[0][0])
+            speed = max(1, round(abs(place - last) / gap_s / table.rad_s_per_tick))
+            if speeds_too:
+                write(servo, **{table.goal_speed_item: speed})
+            last, step = place, step + 1
+        goal = min(max(last, goal - fastest * CYCLE_S), goal + fastest * CYCLE_S)
+        turn_to(bus, 2.6 + goal)
+        for part in (0.0, 0.25, 0.5, 0.75):
+            bus.advance_to(began_ns + round((number + part) * CYCLE_S * 1e9))
+            if number * CYCLE_S > gaps.FADE_S:
+                way.append(servo.shaft_angle)
+    return tuple(way)
+
+
+def deviation(model: str, gap_s: float, *motion: Any) -> float:
+    """Return by how much a motion with gaps leaves that which is sent in each cycle, rad."""
+    ways = way_of(model, gap_s, *motion), way_of(model, CYCLE_S, *motion)
     return max(abs(a - b) for a, b in zip(*ways, strict=True))
 
 
 def true_gap(near: float, tolerance: float, model: str, *motion: Any) -> float:
     """Return the gap at which the deviation is the tolerance, between two whole numbers of cycles."""
     number = math.floor(near / CYCLE_S)
-    found: dict[int, float] = {}
+    below = above = 0.0
     for _ in range(8):
-        for each in (number, number + 1):
-            found.setdefault(each, deviation(model, each * CYCLE_S, *motion))
-        below, above = found[number], found[number + 1]
+        below, above = (deviation(model, each * CYCLE_S, *motion) for each in (number, number + 1))
         if below <= tolerance < above:
             return (number + (tolerance - below) / (above - below)) * CYCLE_S
         number += 1 if above <= tolerance else -1
-    raise AssertionError(f"the tolerance is not left near {near}: {found}")
+    raise AssertionError(f"the tolerance is not left near {near}: {below}, {above}")
 
 
 @known("model degrees", ("MX-64", 1), ("MX-64", 4), ("AX-12A", 5), ("XM430-W350", 4))

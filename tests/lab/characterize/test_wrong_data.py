@@ -139,14 +139,6 @@ def test_a_joint_that_is_stuck_has_no_figures(measures):
     assert done.result.why == ""
 
 
-def test_a_range_that_is_too_small_is_named_with_one_that_would_do(measures):
-    done = measures(["speed"], "AX-12A", reach=0.2)
-    top = done.figure(speeds.TOP)
-    assert top.value is None
-    assert top.why.startswith("the range of 23 deg is too small: the joint reached ")
-    assert done.figure(speeds.ACCELERATION).value is not None
-
-
 @campaign(ci=0, night=1, release=1)
 @pytest.mark.parametrize("model", ["AX-12A", "MX-64"])
 def test_the_range_that_is_named_does(measures, model):
@@ -161,10 +153,13 @@ def lose(rig: Any, cycle: int) -> None:
         bus.servo(1).silence()
 
 
-def test_a_lost_servo_ends_it_and_what_was_measured_before_is_kept(measures):
-    done = measures(["speed", "dead_band"], "AX-12A", each_cycle=lose)
+def test_a_small_range_is_named_and_a_lost_servo_keeps_what_was_measured_before(measures):
+    done = measures(["speed", "dead_band"], "AX-12A", reach=0.2, each_cycle=lose)
+    top = done.figure(speeds.TOP)
+    assert top.value is None
+    assert top.why.startswith("the range of 23 deg is too small: the joint reached ")
+    assert done.figure(speeds.ACCELERATION).value is not None
     assert done.result.why == "joint joint (ID 1 on bus main) is lost"
-    assert done.figure(speeds.TOP).value is not None
     band = done.figure(dead_band.NAME)
     assert (band.value, band.why) == (None, f"the experiment ended early: {done.result.why}")
 
