@@ -144,19 +144,22 @@ def test_nothing_of_the_yardstick_is_on_the_disk(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("compare", "policy", "expected"),
     [
-        (None, None, [("other", "other")]),
-        (None, "fifo", [("fifo", "fifo")]),
-        ("other,round_robin", None, [("other", "other"), ("round_robin", "round_robin")]),
-        ("other, round_robin ,c", None, [("other", "other"), ("round_robin",) * 2, ("c", "round_robin")]),
-        ("c,fifo,other", None, [("c", "fifo"), ("fifo", "fifo"), ("other", "other")]),
-        ("other,fifo,c", "round_robin", [("other",) * 2, ("fifo",) * 2, ("c", "round_robin")]),
-        ("c", None, [("round_robin", "round_robin"), ("c", "round_robin")]),
-        ("c", "other", [("other", "other"), ("c", "other")]),
+        (None, None, "other"),
+        (None, "fifo", "fifo"),
+        ("other,round_robin", None, "other round_robin"),
+        ("other, round_robin ,c", None, "other round_robin c:round_robin"),
+        ("c,fifo,other", None, "c:fifo fifo other"),
+        ("other,fifo,c", "round_robin", "other fifo c:round_robin"),
+        ("c", None, "round_robin c:round_robin"),
+        ("c", "other", "other c:other"),
     ],
 )
 def test_the_yardstick_has_the_policy_of_what_it_is_compared_with(compare, policy, expected):
-    found = conditions(compare, policy)
-    assert [(one.name, one.policy) for one in found] == expected
+    shown = (
+        one.name if one.name == one.policy else f"{one.name}:{one.policy}"
+        for one in conditions(compare, policy)
+    )
+    assert " ".join(shown) == expected
 
 
 @pytest.mark.parametrize(
@@ -170,10 +173,8 @@ def test_the_yardstick_has_the_policy_of_what_it_is_compared_with(compare, polic
     ],
 )
 def test_a_comparison_that_makes_no_sense_is_one_sentence(compare, policy, sentence):
-    with pytest.raises(InputError) as refused:
+    with pytest.raises(InputError, match=f"^{re.escape(sentence)}[^\n]*$"):
         conditions(compare, policy)
-    assert str(refused.value).startswith(sentence)
-    assert "\n" not in str(refused.value)
 
 
 @pytest.mark.parametrize(
@@ -195,10 +196,8 @@ def test_a_comparison_that_makes_no_sense_is_one_sentence(compare, policy, sente
 def test_values_with_which_nothing_can_be_measured_are_one_sentence(change, sentence):
     right = settings(OTHER)
     right.validate_settings(frozenset({0, 1}))
-    with pytest.raises(InputError) as refused:
+    with pytest.raises(InputError, match=f"^{re.escape(sentence)}[^\n]*$"):
         replace(right, **change).validate_settings(frozenset({0, 1}))
-    assert str(refused.value).startswith(sentence)
-    assert "\n" not in str(refused.value)
 
 
 @given(st.integers(1, 40), st.integers(0, 200))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -63,6 +64,15 @@ class Shaft:
         for t_ns in range(0, round(seconds * 1e9), LOOK_NS):
             robot.buses[0].at(t_ns, partial(self.look, t_ns))
 
+    def watching(self, *faults: str) -> Callable[[VirtualRobot], None]:
+        """Return a function that watches the shaft, and injects faults."""
+
+        def begin(robot: VirtualRobot) -> None:
+            self.watch(robot)
+            FaultScript([parse_fault(fault) for fault in faults]).attach(robot.buses)
+
+        return begin
+
     def look(self, t_ns: int) -> None:
         self._servo.advance_to(t_ns)
         self.angles.append(self._servo.shaft_angle - math.pi)
@@ -88,6 +98,8 @@ def shaft():
 
 # Velocity
 
+MOVE = Ask(1.0, "mover", "positions", COMMANDS["positions"])
+
 
 @pytest.mark.parametrize(
     ("rate", "kind"),
@@ -110,27 +122,19 @@ def test_the_shaft_is_never_faster_than_the_limit(tmp_path, shaft, protocol, rat
 
 
 @pytest.mark.parametrize("protocol", [1.0, 2.0])
-def test_behind_a_gear_the_joint_is_never_faster_than_its_limit(tmp_path, shaft, protocol):
+def test_after_a_gear_the_joint_is_never_faster_than_its_limit(tmp_path, shaft, protocol):
     joint = f"gear_ratio: 3, limits: {{position: [-40 deg, 40 deg], velocity: {SPEED} rad/s}}"
     file = robot_file(tmp_path, 1, joint, POSITION, protocol)
-    asks = [Ask(1.0, "mover", "positions", COMMANDS["positions"])]
-    steered(tmp_path, file, 4.5, asks, before=shaft.watch)
+    steered(tmp_path, file, 4.5, [MOVE], before=shaft.watch)
     assert shaft.way == pytest.approx(3 * 0.6, abs=0.05), "it arrives"
     assert shaft.too_far(3 * SPEED) <= 0.03
 
 
 def test_a_servo_that_lost_its_profile_by_a_reset_is_not_faster_either(tmp_path, shaft):
     """Profile Velocity is RAM: 0, no limit, after a reset. A joint that returned waits for a command."""
-
-    def begin(robot: VirtualRobot) -> None:
-        shaft.watch(robot)
-        servo = robot.buses[0].servo(1)
-        robot.buses[0].at(1_500_000_000, lambda: servo.cut_power(1_700_000_000))
-
     file = robot_file(tmp_path, 10, SLOW, POSITION, policies=", on_returned_servo: hold")
-    asks = [Ask(1.0, "mover", "positions", COMMANDS["positions"])]
-    asks.append(Ask(4.0, "mover", "positions", {"positions": [-0.6]}))
-    steered(tmp_path, file, 7.0, asks, before=begin)
+    asks = [MOVE, Ask(4.0, "mover", "positions", {"positions": [-0.6]})]
+    steered(tmp_path, file, 7.0, asks, before=shaft.watching("brownout servo=1 at=1.5s for=200ms"))
     returned, asked = (shaft.angles[round(seconds * 1e9) // LOOK_NS] for seconds in (1.7, 4.0))
     assert 0.1 < returned < 0.4, "on its way"
     assert asked == pytest.approx(returned, abs=0.01), "it waits"
@@ -199,14 +203,16 @@ def test_a_joint_beyond_its_limit_is_driven_back_slowly_by_its_effort_and_by_hol
     ],
 )
 def test_a_lost_wheel_does_not_go_on(tmp_path, shaft, protocol, model, faults):
-    def begin(robot: VirtualRobot) -> None:
-        shaft.watch(robot)
-        FaultScript([parse_fault(fault) for fault in faults]).attach(robot.buses)
-
     joint = "continuous: true, simulation: {inertia: 0.002 kg m^2}, limits: {velocity: 6 rad/s}"
     servo = f"model: {model}, reference: 180 deg"
     file = robot_file(tmp_path, 50, joint, "type: joint_group_velocity_controller", protocol, servo)
-    steered(tmp_path, file, 2.0, [Ask(0.2, "mover", "velocities", {"velocities": [3.0]})], before=begin)
+    steered(
+        tmp_path,
+        file,
+        2.0,
+        [Ask(0.2, "mover", "velocities", {"velocities": [3.0]})],
+        before=shaft.watching(*faults),
+    )
     at = {second: shaft.angles[round(second * 1e9) // LOOK_NS] for second in (0.5, 0.9, 1.35, 1.95)}
     assert at[0.9] - at[0.5] > 0.3, "it turns"
     assert at[1.95] - at[1.35] == pytest.approx(0.0, abs=0.01)
