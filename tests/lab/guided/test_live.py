@@ -109,22 +109,19 @@ def test_a_running_robot_is_recorded_by_its_log_and_left_as_it_was(rig):
             assert any(woken_ns[cycle] <= t_ns <= written_ns[cycle] for t_ns in times)
 
 
-def test_a_joint_that_a_controller_commands_is_refused_with_what_frees_it(rig):
+def test_a_robot_that_is_in_use_is_refused_with_what_frees_it(rig, robot):
     with pytest.raises(InputError) as caught:
         situation_of(rig, ["pan", "tilt"], {})
     assert caught.value.sentences == (
         "joint pan is commanded by pan_hold; free it first: dxlrun switch --deactivate pan_hold --robot pair",
     )
-
-
-def test_a_paused_robot_and_a_second_experiment_are_refused(rig, robot):
     robot.pause()
     try:
         with pytest.raises(InputError, match="pair is paused; resume it first: dxlrun resume"):
             situation_of(rig, ["tilt"], {})
-        rig.load_controller("experiment_pwm", {"type": "sample_player", "joints": ["tilt"]})
     finally:
         robot.resume()
+    rig.load_controller("experiment_pwm", {"type": "sample_player", "joints": ["tilt"]})
     try:
         with pytest.raises(InputError, match=r"another experiment uses pair \(experiment_pwm is"):
             situation_of(rig, ["tilt"], {})
