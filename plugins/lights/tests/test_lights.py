@@ -66,18 +66,13 @@ def written(path: Path, lights: str) -> Path:
     return file
 
 
-def test_light_follows_its_command(run: Run) -> None:
+def test_light_follows_its_command_and_is_written_only_when_that_changes(run: Run) -> None:
     run.send(left=1.0)
     run.run(0.2)
     assert run.leds() == [1, 0]
     run.send(left=0.0, right=1.0)
     run.run(0.2)
     assert run.leds() == [0, 1]
-
-
-def test_led_is_written_only_when_its_command_changes(run: Run) -> None:
-    run.send(left=1.0)
-    run.run(0.2)
     writes = run.writes()
     run.run(3.0)
     assert run.writes() == writes
@@ -155,7 +150,7 @@ def test_first_servo_of_a_joint_of_several_has_the_light(tmp_path: Path) -> None
     assert run.leds() == [0, 0]
 
 
-def test_light_that_is_not_confirmed_off_is_a_warning(tmp_path: Path) -> None:
+def test_light_that_is_not_confirmed_off_is_a_warning_and_the_log_has_its_command(tmp_path: Path) -> None:
     log = tmp_path / "silent.mcap"
     run = Run(log=log)
     run.send(left=1.0)
@@ -163,21 +158,17 @@ def test_light_that_is_not_confirmed_off_is_a_warning(tmp_path: Path) -> None:
     run.bus.servo(1).silence()
     run.run(0.1)
     run.link.close()
-    texts = [event.text for event in read_log(log).events if event.text.startswith("light ")]
+    read = read_log(log)
+    texts = [event.text for event in read.events if event.text.startswith("light ")]
     assert texts == ["light left (ID 1 on bus main) may still be on: no answer"]
+    assert read.cycles["device_command"][-1][0] == 1.0
 
 
-def test_plan_and_log_name_the_package(tmp_path: Path) -> None:
+def test_plan_names_the_package() -> None:
     plan = plan_of(ROBOT)
     assert plan.features[-1].name == "lights"
     assert plan.packages["dxlrun_lights"] == "dxlrun-lights"
     assert plan.loop.source_commands == ("lights/left", "lights/right")
-    log = tmp_path / "lights.mcap"
-    run = Run(log=log)
-    run.send(left=1.0)
-    run.run(0.1)
-    run.link.close()
-    assert read_log(log).cycles["device_command"][-1][0] == 1.0
 
 
 def test_check_lists_the_lights(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:

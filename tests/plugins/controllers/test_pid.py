@@ -54,46 +54,6 @@ def test_the_integral_is_scipys_backward_difference():
     np.testing.assert_allclose([stepped(pid, e, h) for e in errors], theirs, rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("p", [0.5, 4.0, 30.0])
-def test_a_first_order_plant_under_p_follows_its_closed_form(p):
-    """y' = (K u - y) / T, held between samples: y[n] = K p / (1 + K p) (1 - (a - K p (1 - a))**n)."""
-    gain, constant, h = 2.0, 0.5, 0.01
-    a = np.exp(-h / constant)
-    pid, y, path = law(p=p), 0.0, []
-    for _ in range(400):
-        path.append(y)
-        y = a * y + gain * (1 - a) * stepped(pid, 1.0 - y, h)
-    n = np.arange(400)
-    closed = gain * p / (1 + gain * p) * (1 - (a - gain * p * (1 - a)) ** n)
-    np.testing.assert_allclose(path, closed, rtol=1e-10, atol=1e-12)
-
-
-def test_a_first_order_plant_under_pi_follows_its_discrete_solution_and_the_continuous_one():
-    """State (y, I) of the sampled loop; and for short periods the step response of the continuous loop."""
-    from scipy import signal
-
-    gain, constant, p, i = 2.0, 0.5, 1.5, 4.0
-    for h in (0.02, 0.0005):
-        a, steps = np.exp(-h / constant), round(3 / h)
-        b = gain * (1 - a)
-        matrix = np.array([[a - b * (p + i * h), b], [-i * h, 1.0]])
-        drive = np.array([b * (p + i * h), i * h])
-        rest = np.linalg.solve(np.eye(2) - matrix, drive)
-        values, vectors = np.linalg.eig(matrix)
-        start = np.linalg.solve(vectors, -rest)
-        n = np.arange(steps)[:, None]
-        closed = rest[0] + (values**n * start * vectors[0]).sum(axis=1).real
-        pid, y, path = law(p=p, i=i), 0.0, []
-        for _ in range(steps):
-            path.append(y)
-            y = a * y + b * stepped(pid, 1.0 - y, h)
-        np.testing.assert_allclose(path, closed, rtol=1e-9, atol=1e-9)
-        assert rest[0] == pytest.approx(1.0)
-    loop = signal.TransferFunction([gain * p, gain * i], [constant, 1 + gain * p, gain * i])
-    _, continuous = signal.step(loop, T=np.arange(steps) * h)
-    np.testing.assert_allclose(path, continuous, atol=2e-3)
-
-
 @settings(max_examples=50, deadline=None)
 @given(periods=st.lists(st.floats(1e-4, 0.1), min_size=1, max_size=50))
 def test_the_integral_goes_by_true_time_however_irregular_the_periods(periods):
