@@ -14,7 +14,7 @@ and after `====` cases. A case is a sentence and lines:
       => goal arm missed joint grip is...
       => shaft 2 at 2.9: 10 to 20 deg
 
-Expected are each goal that ends, events (`=> event arm turns...`, source or `any`, and text, or `=> no event ...`),
+Expected are each goal that ends, events (`=> event arm turns...`, `=> no event ...`; `any` is each source),
 shafts, deg from the reference, and columns of the log: `=> position elbow from 1.5 to 2: 0.29 to 0.31`, with
 `spread` before the numbers for the difference of the largest and the smallest one, and `step` for the largest
 one of neighbours. Without a time it is the last cycle. `=> topic /pid/state: 0 to 30` is about the ms between
