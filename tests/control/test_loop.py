@@ -11,8 +11,8 @@ from dxlrun.errors import PortError
 
 
 def test_the_phase_stays_and_every_period_is_accounted_for(robot):
-    """100,000 periods with random overruns: what ran plus what was skipped is what passed."""
-    periods, chance, seen = 100_000, random.Random(7), []
+    """20,000 periods with random overruns: what ran plus what was skipped is what passed."""
+    periods, chance, seen = 20_000, random.Random(7), []
     robot.script("idle", joints=("j0",), command=()).build(end_ns=periods * PERIOD_NS).keep_nothing()
     robot.sink.append_cycle = lambda record: seen.append(
         (record.cycle, record.scheduled_ns, record.woken_ns, record.skipped, record.period_ns)
@@ -24,7 +24,7 @@ def test_the_phase_stays_and_every_period_is_accounted_for(robot):
     assert result.reason == "ended"
     assert result.cycles == len(seen) == robot.beats
     assert result.cycles + result.skipped == periods
-    assert result.skipped > 5_000
+    assert result.skipped > 1_000
     np.testing.assert_array_equal(scheduled, start_ns + cycle * PERIOD_NS)
     np.testing.assert_array_equal(skipped[1:], np.diff(cycle) - 1)
     np.testing.assert_array_equal(woken, scheduled)  # virtual time wakes nothing late
