@@ -286,8 +286,8 @@ def test_contributing_md_is_short_and_has_what_ci_runs() -> None:
     ci = (ROOT / ".ci/run").read_text().replace('"', "")
     assert set(re.findall(r"\.lint/bin/(ruff \w+|mypy|lint-imports)", ci)) == linters
     quick = re.findall(r"tests/[\w/.]+", ci)
-    assert len(quick) > 5
+    assert len(quick) >= 5
     assert [folder for folder in quick if not (ROOT / folder).exists()] == []
     (extras,) = re.findall(r"^    .*install -e '\.\[(.+)\]'$", page, re.MULTILINE)
     every = set(tomllib.loads(PROJECT)["project"]["optional-dependencies"])
-    assert set(extras.split(",")) == every - {"release"}  # of 101 MB, to publish
+    assert set(extras.split(",")) == every - {"release", "full"}  # of 101 and 380 MB

@@ -35,7 +35,7 @@ ELSEWHERE = {
     "bench rate": "cli/test_bench.py",
     "doctor": "cli/test_doctor.py",
     "experiment tracking": "lab/tracking/test_command.py",
-    "fleet": "fleet/test_fleet.py",
+    "fleet": "fleet/test_fleet_runs.py",
     "identify": "lab/identify/test_command.py",
     "keys": "remote/test_network_run.py",
     "logs": "analysis/season/test_logs.py",
