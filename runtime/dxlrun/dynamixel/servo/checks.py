@@ -336,6 +336,8 @@ def inspect_states(servos: Sequence[tuple[Access, Mode]], found: Findings) -> Pr
     for again in (False, True):
         for one, mode in servos:
             servo = one.servo
+            if again and servo.servo_id not in before:
+                continue  # Its first reading failed, which is reported already.
             reply = yield from retry(servo_read(one.line, servo))
             problem = ""
             if not reply.answered:
@@ -344,9 +346,9 @@ def inspect_states(servos: Sequence[tuple[Access, Mode]], found: Findings) -> Pr
                     problem = f"no longer answers: {choose_remedy(one.plan.port, CHECK)}"
             else:
                 raw = servo.state.position.tick(reply.parameters)
-                if again and servo.servo_id in before:
+                if again:
                     problem = _jump(servo, before[servo.servo_id], (raw, reply.last_ns))
-                elif not again:
+                else:
                     before[servo.servo_id] = raw, reply.asked_ns
                     problem = _misplaced(servo, raw, mode)
             if problem:
