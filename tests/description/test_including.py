@@ -62,6 +62,7 @@ def test_the_including_file_wins_at_every_depth_but_replaces_lists(including: st
     assert marks.value("joints", "yaw", "id") == Mark(main, 12, 13)
     assert marks.value("joints", "yaw", "model") == Mark(fragment, 5, 35)
     assert marks.origins["joints", "yaw", "limits", "velocity"] == "speed:=1 rad/s"
+    assert marks.origins["loop", "rate"] == "rate:=50"
     assert marks.value("controllers", "head", "joints", 0) == Mark(
         main, 16, 19
     )  # that of the fragment is gone

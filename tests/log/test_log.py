@@ -161,6 +161,7 @@ def test_failed_goals_of_clients_hide_none_of_a_motion_file(log: LogWriter) -> N
     [
         (b"", "the file is empty"),
         (b"name: torso\n", "not an MCAP file"),
+        (b"SQLite format 3\0x", "a ROS 2 bag in SQLite"),
         (b"\x89MCAP0\r\n", "is not a log of dxlrun"),
         (None, "No such file"),
     ],
