@@ -24,7 +24,7 @@ import numpy as np
 import pytest
 from tests.kit.awaited import DEADLINE_S, until
 from tests.kit.campaigns import campaign
-from tests.kit.stories import plugin_folder
+from tests.kit.packages import plugin_folder
 
 from dxlrun.channels import slot
 from dxlrun.channels.child_processes import RunMemory
