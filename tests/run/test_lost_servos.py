@@ -184,7 +184,7 @@ def test_all_joints_of_a_group_lose_their_torque_with_one_of_its_servos(built):
     run.at(GONE_NS / 1e6, run.servos["tilt"].silence)
     for ms in (GONE_NS / 1e6, GONE_NS / 1e6 + 500):
         run.at(ms, lambda: had.extend(run.servos[joint].torque_on for joint in ("pan", "yaw")))
-    log = run.run(replay=False)  # the log lacks the start of the group's policy
+    log = run.run()
     assert had == [True, True, False, True]
     (said,) = [event.text for event in log.events if "group" in event.text]
     assert said == "group neck lost a servo: the group is limp until a client requests torque"

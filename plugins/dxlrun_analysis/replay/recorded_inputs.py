@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from dxlrun import CONTRACT_VERSION, Log, LogError
 from dxlrun.tooling.logs import IDENTITY_NAME, UNREADABLE, changed_code
 from dxlrun.tooling.plans import LoopPlan, PolicyPlan, decode_plan
-from dxlrun.tooling.records import EventCode
+from dxlrun.tooling.records import EventCode, Severity
 from dxlrun.tooling.robots import PlugIns
 from dxlrun.tooling.runs import RunInputs, kept_states_of
 from dxlrun_analysis.conduct.client_commands import client_commands, policy_begun, unlogged_commands
@@ -300,8 +300,9 @@ def _until_policy(log: Log, usable: int) -> tuple[int, int, str]:
     """
     cycles, policy = log.cycles, policy_begun(log)
     if policy is None:
+        begins = (EventCode.POLICY, "loop", Severity.INFO)  # that a group is limp is an error
         begun = [
-            event.t_ns for event in log.events if (event.code, event.source) == (EventCode.POLICY, "loop")
+            event.t_ns for event in log.events if (event.code, event.source, event.severity) == begins
         ]
         ends = int(np.searchsorted(cycles["woken_ns"], begun[0], side="right")) if begun else usable
         if ends >= usable:
