@@ -307,6 +307,23 @@ def test_withdrawn_commands_let_the_goal_come_to_rest_and_hold():
     assert sent[-1].clamped == Clamp(0)
 
 
+@pytest.mark.parametrize("dt_ns", [10_000_000, 50_000_000, 100_000_000])
+def test_a_goal_whose_commands_are_withdrawn_neither_speeds_up_nor_turns_back(dt_ns):
+    random, moving = Random(1), 0
+    for _ in range(300):
+        rig = rig_of(**FAR)
+        before = 0.0
+        for _ in range(random.randint(1, 4)):
+            command = random.uniform(-1.0, 1.0) * random.choice([0.01, 0.1, 1.0])
+            before = [rig.apply(dt_ns, position=command).moved for _ in range(random.randint(1, 5))][-1]
+        moving += before != 0.0
+        for after in [rig.apply(dt_ns).moved for _ in range(3)]:
+            assert after * before >= 0.0
+            assert abs(after) <= abs(before) + 1e-9
+            before = after
+    assert moving > 100
+
+
 def test_a_speed_toward_the_position_holds_for_the_goal_too():
     rig = rig_of()
     sent = [rig.apply(position=1.0, velocity=0.5) for _ in range(100)]

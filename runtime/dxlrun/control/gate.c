@@ -195,8 +195,8 @@ static void steer(const Gate *g, Joint *j, int32_t i, double dt)
         desired = between(fleast(j->lower, goal), g->commands[0][i], fmost(j->upper, goal));
     if (goal != j->left)
         rest(j, goal);
-    double own = (desired - j->target) / dt; /* velocity of the commands; 0 after a jump, see the next line */
-    own = fabs(own) <= highest ? own : 0.0;
+    double own = (desired - j->target) / dt; /* velocity of the commands; 0 after a jump, and without commands */
+    own = j->moves && fabs(own) <= highest ? own : 0.0;
     double behind = desired - goal - own * dt, fastest = highest;
     if (j->moves && !isnan(j->toward))
         fastest = fleast(highest, fmost(fmost(j->toward, SLOWEST), fabs(own)));
