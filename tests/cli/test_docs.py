@@ -54,7 +54,7 @@ TESTS = {
     "by-hand.md": ("tests/hand/test_terminal.py",),
     "from-lerobot-rustypot-sdk.md": (HERE,),
     "gallery.md": ("tests/cli/test_examples.py",),
-    "logs.md": ("tests/analysis/season/test_logs.py", "tests/analysis/export/test_tables.py"),
+    "logs.md": ("tests/analysis/season/test_logs.py", "tests/analysis/export/test_export.py"),
     "results.md": ("tests/lab/tracking/test_command.py",),
     "recipes.md": ("tests/cli/test_recipes.py", "tests/robots/test_stand_up.py"),
     "replay.md": ("tests/analysis/replay/test_command_line.py",),
