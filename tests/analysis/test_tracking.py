@@ -1,4 +1,4 @@
-"""Tracking against the trajectory that a servo could reach, of joints with a known way."""
+"""Tracking against the trajectory that a servo could reach, of known joints; whole and in slices."""
 
 from __future__ import annotations
 
@@ -19,11 +19,17 @@ from dxlrun.channels.cycle import CycleLayout, Torque
 from dxlrun.log.log_reader import Log, read_log
 from dxlrun.output.json import json_text
 from dxlrun.plan.loop_plan import JointPlan
-from dxlrun_analysis.joints.goal_tracking import JointTracking, reachable, tracking
+from dxlrun.testing import simulated_robot
+from dxlrun_analysis.joints import goal_tracking as module
+from dxlrun_analysis.joints.delay import DelayFit
+from dxlrun_analysis.joints.goal_tracking import JointTracking, TrackingCollector, reachable, tracking
+from dxlrun_analysis.page.report_page import analyzed_page
 from dxlrun_analysis.report import analyze, tables
 
+ROBOTS = Path(__file__).parents[2] / "robots"
 DT = 0.02
 TICK = math.radians(300) / 1023
+NAN = math.nan
 Way = npt.NDArray[np.float64]
 Make = Callable[..., Log]
 NECK = JointPlan("neck", -3.0, 3.0, None, top_speed=6.0)
@@ -31,12 +37,12 @@ NECK = JointPlan("neck", -3.0, 3.0, None, top_speed=6.0)
 
 @pytest.fixture
 def make(tmp_path: Path) -> Make:
-    """Return a log of one AX-12A that was sent these goals, and was read at these positions, one a cycle."""
+    """Return a log of one MX-64 that was sent these goals, and was read at these positions, one a cycle."""
 
     def make(
         goals: Way,
         positions: Way,
-        speed: float = math.nan,
+        speed: float = NAN,
         registers: dict[str, int] | None = None,
         **joint: Any,
     ) -> Log:
@@ -76,23 +82,35 @@ def only(log: Log) -> JointTracking:
     return joint
 
 
-def test_the_way_of_a_step_is_no_error(make: Make) -> None:
-    log = make(stepped(150, 10, 1.0), ramp(150, 10, 1.0, 0.5), speed=0.5)
-    joint = only(log)
-    assert (joint.rms_rad, joint.worst_rad) == pytest.approx((0.0, 0.0), abs=1e-9)
-    assert (joint.lag_ms, joint.settling_ms, joint.rest_rad) == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
+# Ways
 
 
-@pytest.mark.parametrize(
-    ("limits", "speed"), [({}, 6.0), ({"velocity": 2.0}, 2.0), ({"top_speed": None}, None)]
-)
-def test_without_a_speed_the_lower_one_of_the_limits_counts(
-    make: Make, limits: dict[str, float | None], speed: float | None
-) -> None:
-    log = make(stepped(100, 10, 1.0), np.zeros(100), **limits)
-    expected = ramp(100, 10, 1.0, 1e9 if speed is None else speed)
-    assert reachable(log, 0) == pytest.approx(expected)
-    assert only(log).worst_rad == pytest.approx(1.0)  # it never moved, and that is an error
+STEP = stepped(100, 10, 1.0)
+UNKNOWN_FIRST = np.where(np.arange(100) < 20, NAN, 1.0)
+READ_LATER = np.where((np.arange(100) >= 20) & (np.arange(100) < 23), NAN, 0.4)
+WAYS: dict[str, tuple[Way, Way, dict[str, Any], Way]] = {
+    "no speed: that of the servo": (STEP, np.zeros(100), {}, ramp(100, 10, 1.0, 6.0)),
+    "no speed: the limit of the joint": (STEP, np.zeros(100), {"velocity": 2.0}, ramp(100, 10, 1.0, 2.0)),
+    "no speed, no limit": (STEP, np.zeros(100), {"top_speed": None}, ramp(100, 10, 1.0, 1e9)),
+    "a speed of 0 is the slowest, not none": (STEP, np.zeros(100), {"speed": 0.0}, ramp(100, 10, 1.0, 0.01)),
+    "a first goal: from where it stands": (
+        *(np.full(100, 1.0), np.zeros(100), {"speed": 0.5}),
+        ramp(100, 0, 1.0, 0.5),
+    ),
+    "a goal before it is read": (
+        *(UNKNOWN_FIRST, READ_LATER, {"speed": 0.5}),
+        np.where(np.arange(100) < 23, NAN, 0.4 + ramp(100, 23, 0.6, 0.5)),
+    ),
+}
+
+
+@pytest.mark.parametrize("which", WAYS)
+def test_a_way_is_as_fast_as_the_servo_may_be(make: Make, which: str) -> None:
+    goals, positions, options, expected = WAYS[which]
+    log = make(goals, positions, **options)
+    assert reachable(log, 0) == pytest.approx(expected, nan_ok=True)
+    # it never moved, and that is an error
+    assert only(log).worst_rad == pytest.approx(np.nanmax(np.abs(expected - positions)))
 
 
 def test_a_declared_acceleration_counts(make: Make) -> None:
@@ -107,59 +125,11 @@ def test_a_declared_acceleration_counts(make: Make) -> None:
     assert way.max() == 1.0
 
 
-def test_lag_is_the_delay_on_the_way(make: Make) -> None:
-    log = make(stepped(200, 10, 1.0), ramp(200, 10, 1.0, 0.5, delay=3), speed=0.5)
-    joint = only(log)
-    assert joint.lag_ms == pytest.approx(60.0, rel=0.02)
-    assert joint.worst_rad == pytest.approx(0.5 * 0.06)
-    assert joint.settling_ms == pytest.approx(20.0, abs=20.1)  # 0.03 of a way of 1 are left, and 2 % are near
-    assert joint.rest_rad == pytest.approx(0.0, abs=1e-9)
-
-
-@pytest.mark.filterwarnings("error")
-def test_a_joint_that_rests_wherever_its_goals_are_known_has_no_lag(make: Make) -> None:
-    goals = np.concatenate((np.full(60, 0.0), np.full(80, np.nan), np.full(60, 1.0)))  # an effort in between
-    assert only(make(goals, np.nan_to_num(goals))).lag_ms is None
-
-
-def test_a_stream_that_the_servo_can_follow_is_its_own_way(make: Make) -> None:
-    t = np.arange(500) * DT
-    goals, late = 0.4 * np.sin(2 * t), 0.4 * np.sin(2 * (t - DT - 0.03))
-    joint = only(make(goals, late))
-    assert joint.lag_ms == pytest.approx(30.0, rel=0.02)
-    assert joint.worst_rad == pytest.approx(0.8 * 0.03, rel=0.02)
-    assert (joint.settling_ms, joint.rest_rad) == (None, None)
-
-
 def test_a_stream_that_is_too_fast_is_cut_to_the_speed_that_there_is(make: Make) -> None:
     goals = np.concatenate((np.linspace(0.0, 4.0, 50), np.full(150, 4.0)))  # 4 rad/s
-    log = make(goals, np.zeros(200), velocity=2.0)
-    way = reachable(log, 0)
+    way = reachable(make(goals, np.zeros(200), velocity=2.0), 0)
     assert np.diff(way).max() == pytest.approx(2.0 * DT)
     assert int(np.argmax(way == 4.0)) == pytest.approx(100, abs=2)
-
-
-def test_ringing_is_settling_and_sagging_is_error_at_rest(make: Make) -> None:
-    after = np.maximum(np.arange(300) - 110, 0) * DT  # 1 rad at 0.5 rad/s from cycle 10 on
-    rings = 0.1 * np.exp(-after / 0.2) * np.sin(20 * after) * (after > 0)
-    joint = only(make(stepped(300, 10, 1.0), ramp(300, 10, 1.0, 0.5) + rings - 0.05 * (after > 0), speed=0.5))
-    outside = after[np.abs(rings) > 0.02].max()
-    assert joint.settling_ms == pytest.approx((outside + DT) * 1e3, abs=21)
-    assert joint.settling_ms is not None
-    assert joint.settling_ms > 200
-    assert joint.rest_rad == pytest.approx(0.05, abs=2e-3)
-
-
-def test_a_way_begins_where_the_joint_stands_when_it_gets_a_goal(make: Make) -> None:
-    goals = np.concatenate((np.full(20, np.nan), np.full(80, 1.0)))
-    positions = np.full(100, 0.4)
-    positions[20:23] = np.nan  # and is read
-    log = make(goals, positions, speed=0.5)
-    way = reachable(log, 0)
-    assert np.isnan(way[:23]).all()
-    assert way[23:] == pytest.approx(np.minimum(0.4 + np.arange(77) * DT * 0.5, 1.0))
-    nothing = only(make(np.full(20, np.nan), positions[:20]))
-    assert (nothing.rms_rad, nothing.worst_rad, nothing.lag_ms, nothing.rest_rad) == (None, None, None, None)
 
 
 def test_a_joint_that_is_given_torque_goes_to_no_goal_from_before(make: Make) -> None:
@@ -172,40 +142,79 @@ def test_a_joint_that_is_given_torque_goes_to_no_goal_from_before(make: Make) ->
     assert reachable(log, 0)[62:] == pytest.approx(np.full(38, -4 * math.pi))
 
 
-def test_a_speed_of_0_is_the_slowest_and_not_none(make: Make) -> None:
-    way = reachable(make(stepped(100, 10, 1.0), np.zeros(100), speed=0.0), 0)
-    assert way[-1] == pytest.approx(89 * DT * 0.01)
+# Errors, lag, settling
 
 
-def test_of_several_ways_the_longest_settling_and_the_greatest_error_at_rest_count(make: Make) -> None:
+def late_sine() -> tuple[Way, Way]:
+    t = np.arange(500) * DT
+    return 0.4 * np.sin(2 * t), 0.4 * np.sin(2 * (t - DT - 0.03))
+
+
+def two_ways() -> tuple[Way, Way]:
+    """The first rests 0.05 rad off, the second comes there 30 cycles after its way."""
     goals = np.concatenate((stepped(150, 10, 1.0), np.full(150, 2.0)))
     way = np.concatenate((ramp(150, 10, 1.0, 0.5), 1.0 + ramp(150, 0, 1.0, 0.5)))
-    way[110:151] += 0.05  # the first rests farther off, the second comes there later
-    joint = only(make(goals, np.where(way > 1.5, way - 0.2 * (np.arange(300) < 280), way), speed=0.5))
-    assert joint.rest_rad == pytest.approx(0.05, abs=0.002)
-    assert joint.settling_ms is not None
-    assert joint.settling_ms > 300
+    way[110:151] += 0.05
+    return goals, np.where(way > 1.5, way - 0.2 * (np.arange(300) < 280), way)
+
+
+def with_an_effort_in_between() -> tuple[Way, Way]:
+    goals = np.concatenate((np.zeros(60), np.full(80, NAN), np.ones(60)))
+    return goals, np.nan_to_num(goals)
+
+
+def near(value: float, within: float = 1e-6) -> Any:
+    return pytest.approx(value, abs=within)
+
+
+NUMBERS = ("rms_rad", "worst_rad", "lag_ms", "settling_ms", "rest_rad")
+ANY = object()
+JOINTS: dict[str, tuple[tuple[Way, Way], float, tuple[object, ...]]] = {
+    "the way of a step": (
+        *((stepped(150, 10, 1.0), ramp(150, 10, 1.0, 0.5)), 0.5),
+        (near(0.0), near(0.0), near(0.0), near(0.0), near(0.0)),
+    ),
+    "a delay: 0.03 of a way of 1 are left, and 2 % are near": (
+        *((stepped(200, 10, 1.0), ramp(200, 10, 1.0, 0.5, delay=3)), 0.5),
+        (ANY, near(0.03), near(60.0, 1.2), near(20.0, 20.1), near(0.0)),
+    ),
+    "at rest wherever its goals are known": (with_an_effort_in_between(), NAN, (ANY, ANY, None, ANY, ANY)),
+    "a stream that it can follow": (late_sine(), NAN, (ANY, near(0.024, 5e-4), near(30.0, 0.6), None, None)),
+    "no goal": ((np.full(20, NAN), np.full(20, 0.4)), NAN, (None, None, None, ANY, None)),
+    "two ways": (two_ways(), 0.5, (ANY, ANY, ANY, near(600.0, 21.0), near(0.05, 0.002))),
+}
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("which", JOINTS)
+def test_joint_is_measured_against_its_way(make: Make, which: str) -> None:
+    (goals, positions), speed, expected = JOINTS[which]
+    joint = only(make(goals, positions, speed=speed))
+    for name, value in zip(NUMBERS, expected, strict=True):
+        assert value is ANY or getattr(joint, name) == value, name
+
+
+def test_ringing_is_settling_and_sagging_is_error_at_rest(make: Make) -> None:
+    after = np.maximum(np.arange(300) - 110, 0) * DT  # 1 rad at 0.5 rad/s from cycle 10 on
+    rings = 0.1 * np.exp(-after / 0.2) * np.sin(20 * after) * (after > 0)
+    joint = only(make(stepped(300, 10, 1.0), ramp(300, 10, 1.0, 0.5) + rings - 0.05 * (after > 0), speed=0.5))
+    outside = after[np.abs(rings) > 0.02].max()
+    assert outside > 0.2
+    assert joint.settling_ms == pytest.approx((outside + DT) * 1e3, abs=21)
+    assert joint.rest_rad == pytest.approx(0.05, abs=2e-3)
 
 
 def test_states_that_are_not_valid_are_no_error_and_a_joint_that_stands_has_no_lag(make: Make) -> None:
     positions = np.full(100, 0.001 * np.arange(100) % 2)
-    positions[50] = np.nan
+    positions[50] = NAN
     log = make(np.zeros(100), positions)
-    cycles = log.cycles.copy()
-    cycles["position"][50, 0] = 3.0  # any value may stand there
-    joint = only(replace(log, cycles=cycles))
+    log.cycles["position"][50, 0] = 3.0  # any value may stand there
+    joint = only(log)
     assert (joint.invalid, joint.lag_ms) == (1, None)
     assert joint.worst_rad == pytest.approx(0.099)
 
 
-def test_a_first_goal_is_approached_from_where_the_joint_stands(make: Make) -> None:
-    way = reachable(make(np.full(100, 1.0), np.zeros(100), speed=0.5), 0)
-    assert way[1:] == pytest.approx(np.minimum(np.arange(1, 100) * DT * 0.5, 1.0), abs=DT)
-
-
 def test_terminal_report_and_json_have_the_same_numbers(make: Make) -> None:
-    from dxlrun_analysis.page.report_page import analyzed_page
-
     log = make(stepped(200, 10, 1.0), ramp(200, 10, 1.0, 0.5, delay=3), speed=0.5)
     report = analyze(log)
     (row,) = tables(report)["joints"].rows
@@ -216,3 +225,99 @@ def test_terminal_report_and_json_have_the_same_numbers(make: Make) -> None:
     assert as_json["worst_rad"] == pytest.approx(0.03)
     words = "worst 1.72 deg (position minus reachable trajectory), lag 59 ms, settled after"
     assert words in analyzed_page(log)[1]
+
+
+# Slices
+
+
+@pytest.fixture(scope="module")
+def torso(tmp_path_factory: pytest.TempPathFactory) -> Log:
+    path = tmp_path_factory.mktemp("torso") / "run.mcap"
+    play = [ROBOTS / "motions/three_parts.yaml"]
+    simulated_robot(ROBOTS / "bioloid_torso.yaml", play=play, duration_s=9.0, log=path).run()
+    return read_log(path)
+
+
+def changed(log: Log, seed: int) -> Log:
+    """Return a log with steps of its goals, speeds that do not reach them in a cycle, and missing states."""
+    chance = np.random.default_rng(seed)
+    cycles = log.cycles.copy()
+    count, joints = cycles["goal_position"].shape
+    steps = np.repeat(chance.uniform(-1, 1, (count // 25 + 1, joints)), 25, axis=0)[:count]
+    cycles["goal_position"] += np.where(chance.random(joints) < 0.5, steps, 0.0)
+    cycles["goal_velocity"] = np.where(chance.random(joints) < 0.5, chance.uniform(0.2, 3.0, joints), NAN)
+    cycles["goal_position"][chance.random((count, joints)) < 0.002] = NAN
+    cycles["valid"] &= chance.random((count, joints)) > 0.02
+    plan = log.attachments["plan.json"]
+    if seed % 2:
+        register = b'"registers":[{"name":"goal_acceleration","value":3}]'
+        plan = plan.replace(b'"registers":[]', register).replace(b"AX-12A", b"MX-64")
+    return replace(log, cycles=cycles, attachments={**log.attachments, "plan.json": plan})
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_slices_give_what_the_whole_log_gives(torso: Log, seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    log = changed(torso, seed) if seed else torso
+    whole = tracking(log)  # shorter than a block
+    assert any(joint.lag_ms is not None for joint in whole)
+    monkeypatch.setattr(module, "_BLOCK", 100)
+    for size in (1, 37, 10_000):
+        collected = TrackingCollector()
+        for start in range(0, len(log.cycles), size):
+            collected.add_slice(replace(log, cycles=log.cycles[start : start + size]))
+        for found, expected in zip(collected.evaluate_joints(log), whole, strict=True):
+            for name in (*NUMBERS, "invalid", "oldest_ms", "clamped", "delay_ms"):
+                value = getattr(expected, name)
+                close = value if value is None else pytest.approx(value, rel=1e-9, abs=1e-12)
+                assert getattr(found, name) == close, (size, name)
+
+
+def test_what_rests_for_very_long_is_kept_in_bounded_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_LONGEST_REST_S", 0.5)
+    found, rested = module._OpenRest(), []
+    for start in range(0, 10_000, 50):
+        times = np.arange(start, start + 50) * 0.02
+        rested += list(found.find_rests(times, np.zeros(50), np.full(50, 0.01), 1e-3, final=False))
+        assert len(found.times) <= 76
+    assert len(rested) > 100
+    assert {rest.error_rad for rest in rested} == {0.01}
+
+
+# Delay
+
+
+NUMBER = np.arange(2000)
+SWING = np.sin(NUMBER * 0.05)
+
+
+def fitted(goal: Way, position: Way, size: int = 100) -> float | None:
+    """Return the delay of a joint that was sent these goals, counted in slices."""
+    fit = DelayFit()
+    for start in range(0, len(NUMBER), size):
+        first = max(0, start - 2)
+        part = slice(first, start + size)
+        fit.add_cycles(NUMBER[part] * DT, goal[part], position[part], start - first)
+    return fit.best_s(0.01)
+
+
+@pytest.mark.parametrize("cycles", [1.0, 3.0, 4.5, 11.0, 20.25])
+@pytest.mark.parametrize("size", [100, 2000])
+def test_the_delay_is_found_to_a_tenth_of_a_cycle(cycles: float, size: int) -> None:
+    late = np.sin((NUMBER - cycles) * 0.05)
+    noise = 0.05 * np.random.default_rng(1).standard_normal(len(NUMBER))
+    assert fitted(SWING, late, size) == pytest.approx(cycles * DT, abs=0.002)
+    assert fitted(SWING, late + noise, size) == pytest.approx(cycles * DT, abs=0.003)
+
+
+def test_the_delay_is_refused_where_none_explains_the_difference() -> None:
+    assert fitted(SWING, np.sin((NUMBER - 60) * 0.05)) is None  # beyond the longest
+    assert fitted(SWING, np.full(2000, 0.3)) is None  # a joint that is blocked
+    assert fitted(np.full(2000, 0.5), np.full(2000, 0.5)) is None
+    assert DelayFit().best_s(0.01) is None
+
+
+def test_joints_of_a_run_have_a_delay_where_they_moved(torso: Log) -> None:
+    delays = {joint.name: joint.delay_ms for joint in tracking(torso)}
+    assert delays["right_elbow_joint"] is not None
+    assert 0 < delays["right_elbow_joint"] < 100
+    assert not any(value is not None and math.isnan(value) for value in delays.values())
