@@ -301,9 +301,7 @@ def _until_policy(log: Log, usable: int) -> tuple[int, int, str]:
     cycles, policy = log.cycles, policy_begun(log)
     if policy is None:
         begins = (EventCode.POLICY, "loop", Severity.INFO)  # that a group is limp is an error
-        begun = [
-            event.t_ns for event in log.events if (event.code, event.source, event.severity) == begins
-        ]
+        begun = [event.t_ns for event in log.events if (event.code, event.source, event.severity) == begins]
         ends = int(np.searchsorted(cycles["woken_ns"], begun[0], side="right")) if begun else usable
         if ends >= usable:
             return usable, usable, ""
