@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -10,7 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 from tests.kit.campaigns import campaign
-from tests.kit.experiments import ROBOTS, Plays, perform, sine, state_of
+from tests.kit.experiments import ROBOTS, Plays, Segments, perform, sine, state_of
 
 from dxlrun.channels.commands import LOOP, CommandMessage
 from dxlrun.errors import DxlrunError, Refused
@@ -26,77 +27,74 @@ from dxlsim.faults.script import FaultScript
 ARM = ROBOTS / "effort_arm.yaml"
 
 
+def interrupted(rig: Any, act: Callable[[], object]) -> Segments:
+    """Return two segments, in the second of which something happens after half a second."""
+
+    def segments(joint):
+        yield sine(joint, 400)
+        bus, now_ns = rig.robot.link.simulated.buses[0], rig.robot.link.simulated.clock.now_ns()
+        bus.at(now_ns + 500_000_000, act)
+        yield sine(joint, 400, 3.0)
+        raise AssertionError("nothing follows")
+
+    return segments
+
+
 def happen(rig: Any, fault: str) -> None:
-    """Let a fault happen now."""
     script = FaultScript(())
     script.attach(rig.robot.link.simulated.buses)
     script.add(parse_fault(fault), rig.robot.link.simulated.clock.now_ns())
 
 
-def in_half_a_second(rig: Any, act: Callable[[], object]) -> None:
-    rig.robot.link.simulated.buses[0].at(rig.robot.link.simulated.clock.now_ns() + 500_000_000, act)
-
-
-def interrupted(rig: Any, act: Callable[[], object]) -> Plays:
-    """Return an experiment of two segments, in the second of which something happens."""
-
-    def segments(joint):
-        yield sine(joint, 400)
-        in_half_a_second(rig, act)
-        yield sine(joint, 400, 3.0)
-        raise AssertionError("nothing follows")
-
-    return Plays(segments)
-
-
-def test_a_servo_that_is_lost_ends_it_and_what_was_measured_is_kept(own_rig):
-    """The runtime holds controllers of lost joints, so the player itself cannot end its goal."""
+@pytest.mark.parametrize(
+    ("fault", "why", "valid"),
+    [
+        # the runtime holds controllers of lost joints, so the player itself cannot end its goal
+        ("silence servo=2 for=3s", r"joint elbow (\(ID 2 on bus main\) is lost|.* for 100 ms)", [False]),
+        ("overheat servo=2 celsius=75", "joint elbow has 75 deg C, more than 70", [True]),
+    ],
+    ids=["lost", "hot"],
+)
+def test_a_servo_that_is_lost_or_hot_ends_it_and_what_was_measured_is_kept(own_rig, fault, why, valid):
     rig = own_rig(ARM)
-    plays = interrupted(rig, lambda: happen(rig, "silence servo=2 for=3s"))
-    _, done = perform(rig, "elbow", plays.segments)
-    assert done.why in (
-        "joint elbow (ID 2 on bus main) is lost",
-        "joint elbow has not answered for 100 ms",
-    )
-    assert [part.whole for part in done.recorded] == [True, False]
-    last = done.recorded[1]
-    assert 150 < np.count_nonzero(last.valid[:, 0]) < 250, "until it was lost"
-    assert not last.valid[-1, 0]
-
-
-def test_a_servo_that_gets_hot_ends_it(own_rig):
-    rig = own_rig(ARM)
-    plays = interrupted(rig, lambda: happen(rig, "overheat servo=2 celsius=75"))
-    _, done = perform(rig, "elbow", plays.segments)
-    assert done.why == "joint elbow has 75 deg C, more than 70"
-    assert np.nanmax(done.recorded[1].of_joints("temperature")) == 75
-    assert len(done.recorded[1]) < 3 * 400
+    _, done = perform(rig, "elbow", interrupted(rig, lambda: happen(rig, fault)))
+    assert re.fullmatch(why, done.why)
+    first, last = done.recorded
+    assert (first.whole, last.whole, last.valid[-1].tolist()) == (True, False, valid)
+    assert 150 < np.count_nonzero(last.valid[:, 0]) < (250 if valid == [False] else 1200)
+    assert np.nanmax(last.of_joints("temperature")) == (30 if valid == [False] else 75)
 
 
 def test_a_joint_whose_torque_is_switched_off_ends_it(own_rig):
     rig = own_rig(ARM)
     data = msgspec.json.encode({"joints": ["elbow"], "on": False, "release": True})
     off = CommandMessage(1_000_000, LOOP, "torque", data, "a person")
-    plays = interrupted(rig, lambda: rig.robot.link.gateways_link._mailbox.post_command(off))
+    plays = Plays(interrupted(rig, lambda: rig.robot.link.gateways_link._mailbox.post_command(off)))
     done = perform_experiment(rig, plays, situation_of(rig, ["elbow"], {}))
     assert done.why == "experiment_position was deactivated"
     assert [part.whole for part in done.recorded] == [True, False]
-    # its controllers cannot be active without torque, and that is reported
-    assert len(done.not_restored) == 1
-    assert "elbow" in done.not_restored[0]
+    (sentence,) = done.not_restored  # its controllers cannot be active without torque
+    assert "elbow" in sentence
     assert not [one for one in rig.controllers() if one.name.startswith("experiment")]
 
 
 def test_a_run_that_ends_in_the_middle_ends_it(own_rig):
     rig = own_rig(ARM)
-    plays = interrupted(rig, rig.robot.link.simulated.stop.request)
+    link = rig.robot.link
+    cycles = link.simulated.cycles
+    assert rig.rate == 400
+    assert rig.joints()
+    assert link.simulated.cycles == cycles, "a look takes no cycle"
+    plays = Plays(interrupted(rig, link.simulated.stop.request))
     done = perform_experiment(rig, plays, situation_of(rig, ["elbow"], {}))
     assert done.why == "the run ended"
     assert done.not_restored == ("the run of effort_arm ended, so the run was not restored",)
     assert [part.outcome for part in done.recorded] == ["reached", "aborted"]
     assert len(done.recorded[1]) == pytest.approx(200, abs=15)
-    with pytest.raises(RunGone):
-        rig.change_rate(100)
+    assert rig.joints()
+    for asked in (rig.change_rate, rig.robot.rate):
+        with pytest.raises(RunGone, match="the run of effort_arm ended"):
+            asked(100)
 
 
 class HalfRestored:
@@ -157,45 +155,22 @@ def test_a_procedure_that_fails_leaves_the_run_as_it_was(arm):
     assert state_of(arm) == before
 
 
-def test_an_abort_before_the_first_segment_moves_nothing(arm):
-    places = []
-    goals = arm.robot.link.simulated.record.goals
-    arm.robot.link.each_cycle = lambda cycle: places.append(float(goals.position[1]))
-
-    def far(joint):
-        yield Segment("far", 0.01, {joint.name: np.full(10, joint.upper)})
-
-    _, done = perform(arm, "elbow", far, lambda: "aborted by a key")
-    assert (done.why, done.recorded, set(places)) == ("aborted by a key", (), set())
-
-
-def test_an_abort_in_a_motion_cancels_its_goal(arm):
+def test_an_abort_moves_nothing_before_the_first_segment_and_cancels_the_goal_of_one(arm):
     """So that the joints come to rest before the player leaves."""
+    places, goals = [], arm.robot.link.simulated.record.goals
+    arm.robot.link.each_cycle = lambda cycle: places.append(float(goals.position[1]))
+    far = Segment("far", 0.01, {"elbow": np.full(10, np.radians(30))})
+    _, done = perform(arm, "elbow", lambda joint: iter([far]), lambda: "a key")
+    assert (done.why, done.recorded, set(places)) == ("a key", (), set())
     at_s = arm.now_s + 1.5
-
-    def abort():
-        return "aborted by a key" if arm.now_s >= at_s else None
-
-    _, done = perform(arm, "elbow", lambda joint: iter([sine(joint, 400, 10.0)]), abort)
-    assert done.why == "aborted by a key"
+    _, done = perform(
+        arm,
+        "elbow",
+        lambda joint: iter([sine(joint, 400, 10.0)]),
+        lambda: "a key" if arm.now_s >= at_s else None,
+    )
+    assert done.why == "a key"
     assert arm.robot.goals()[-1].status == "cancelled"
-
-
-def test_a_mere_look_takes_no_cycle_and_a_run_that_ended_is_an_error(own_rig):
-    rig = own_rig(ARM)
-    link = rig.robot.link
-    cycles = link.simulated.cycles
-    assert rig.rate == 400
-    assert rig.joints()
-    assert link.simulated.cycles == cycles
-    rig.robot.rate(200)
-    assert link.simulated.cycles == cycles + 1
-    link.simulated.stop.request()
-    while link.alive:
-        link.run_cycle()
-    assert rig.joints()
-    with pytest.raises(RunGone, match="the run of effort_arm ended"):
-        rig.robot.rate(400)
 
 
 def many(rng: random.Random) -> Any:
@@ -231,10 +206,7 @@ def test_an_abort_at_any_time_leaves_the_run_as_it_was(own_rig, number, chance):
     if loses:
         simulated.buses[0].at(round(lost_s * 1e9), lambda: happen(rig, "silence servo=2 for=200ms"))
 
-    def abort():
-        return "aborted by a key" if rig.now_s >= at_s else None
-
-    _, done = perform(rig, "elbow", many(chance), abort)
+    _, done = perform(rig, "elbow", many(chance), lambda: "aborted by a key" if rig.now_s >= at_s else None)
     assert done.why == "" or done.why.startswith(("aborted by a key", "joint elbow "))
     assert all(part.whole for part in done.recorded[:-1])
     assert not simulated.robot.loop.steering.inbox.drain_commands()

@@ -4,22 +4,21 @@ from __future__ import annotations
 
 import os
 import signal
-import socket
-import struct
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 from tests.kit.awaited import DEADLINE_S, until
 from tests.kit.campaigns import campaign
 from tests.kit.experiments import ROOT, Plays, perform, sine, state_of
+from tests.kit.live_run import LiveRuns
 
 import dxlrun
 from dxlrun.cli import main
@@ -37,7 +36,6 @@ from dxlrun_lab.guided.segment import Segment
 
 pytestmark = pytest.mark.long
 
-CODE = "import sys; from dxlrun.cli import main; sys.exit(main())"
 ROBOT = """\
 name: pair
 buses:
@@ -52,31 +50,40 @@ controllers:
 """
 
 
+VIRTUAL = ExperimentOptions(virtual=True)
+
+
 @pytest.fixture(scope="module")
-def place(tmp_path_factory):
+def runs(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         directory = tmp_path_factory.mktemp("live")
         patch.setenv("XDG_RUNTIME_DIR", str(directory))
         patch.chdir(directory)
+        runs = LiveRuns(directory)
+        runs.shared = []
         (directory / "pair.yaml").write_text(ROBOT)
-        yield directory
+        yield runs
+        runs.end()
 
 
-@pytest.fixture(scope="module")
-def robot(place):
-    """A run that does not belong to an experiment."""
-    words = [sys.executable, "-P", "-c", CODE, "pair.yaml", "--duration", "300"]
-    with (place / "said").open("wb") as said:
-        process = subprocess.Popen(words, stdout=said, stderr=said)
+@pytest.fixture
+def place(runs):
+    return Path.cwd()
 
-    def lives() -> None:
-        assert process.poll() is None, (place / "said").read_text()
 
-    until(dxlrun.running, check=lives)
+@pytest.fixture
+def running(runs):
+    """A run that does not belong to an experiment; another one after one that died."""
+    if not runs.shared or runs.shared[-1].process.poll() is not None:
+        runs.shared.append(runs.start("--duration", "300", gateway=True))
+        until(dxlrun.running, check=runs.shared[-1].lives)
+    return runs.shared[-1]
+
+
+@pytest.fixture
+def robot(running):
     with dxlrun.connect() as robot:
         yield robot
-    process.terminate()  # its gateway may be gone
-    process.wait(DEADLINE_S)  # the verdict is that of a machine that others use too
 
 
 @pytest.fixture
@@ -89,6 +96,10 @@ def rig(robot):
 def two(joint: ExperimentJoint) -> Iterator[Segment]:
     yield sine(joint, 100, 0.5, settle_s=0.1)
     yield sine(joint, 50, 0.5, loop_rate=50)
+
+
+def short(joint: ExperimentJoint) -> Iterator[Segment]:
+    yield sine(joint, 100, 0.1)
 
 
 def test_a_running_robot_is_recorded_by_its_log_and_left_as_it_was(rig):
@@ -109,6 +120,13 @@ def test_a_running_robot_is_recorded_by_its_log_and_left_as_it_was(rig):
             assert any(woken_ns[cycle] <= t_ns <= written_ns[cycle] for t_ns in times)
 
 
+@contextmanager
+def another_experiment(rig, interface):
+    rig.load_controller(f"experiment_{interface}", {"type": "sample_player", "joints": ["tilt"]})
+    yield
+    rig.unload_controller(f"experiment_{interface}")
+
+
 def test_a_robot_that_is_in_use_is_refused_with_what_frees_it(rig, robot):
     with pytest.raises(InputError) as caught:
         situation_of(rig, ["pan", "tilt"], {})
@@ -116,46 +134,32 @@ def test_a_robot_that_is_in_use_is_refused_with_what_frees_it(rig, robot):
         "joint pan is commanded by pan_hold; free it first: dxlrun switch --deactivate pan_hold --robot pair",
     )
     robot.pause()
-    try:
-        with pytest.raises(InputError, match="pair is paused; resume it first: dxlrun resume"):
-            situation_of(rig, ["tilt"], {})
-    finally:
-        robot.resume()
-    rig.load_controller("experiment_pwm", {"type": "sample_player", "joints": ["tilt"]})
-    try:
-        with pytest.raises(InputError, match=r"another experiment uses pair \(experiment_pwm is"):
-            situation_of(rig, ["tilt"], {})
-    finally:
-        rig.unload_controller("experiment_pwm")
-    assert not rig.paused
-
-
-def test_of_two_experiments_that_begin_at_once_one_is_refused(rig, robot):
+    with pytest.raises(InputError, match="pair is paused; resume it first: dxlrun resume"):
+        situation_of(rig, ["tilt"], {})
+    robot.resume()
     situation = situation_of(rig, ["tilt"], {})
-    rig.load_controller("experiment_position", {"type": "sample_player", "joints": ["tilt"]})
-    before = state_of(rig)
-    done = perform_experiment(rig, Plays(two), situation)
-    assert (done.recorded, done.not_restored, state_of(rig)) == ((), (), before)
-    assert "experiment_position" in done.why
-    rig.unload_controller("experiment_position")
-
-
-def logging_to(log: Path | None) -> Any:
-    """Return as much of a running robot as a rig looks at first."""
-    return SimpleNamespace(name="pair", info=lambda: {"log": log and str(log)})
+    used = pytest.raises(InputError, match=r"another experiment uses pair \(experiment_pwm is")
+    with another_experiment(rig, "pwm"), used:
+        situation_of(rig, ["tilt"], {})
+    with another_experiment(rig, "position"):  # both began at once
+        before = state_of(rig)
+        done = perform_experiment(rig, Plays(two), situation)
+        assert (done.recorded, done.not_restored, state_of(rig)) == ((), (), before)
+        assert "experiment_position" in done.why
+    assert not rig.paused
 
 
 @pytest.mark.needs("identify")
 def test_a_robot_without_its_whole_log_is_refused(tmp_path, monkeypatch, capsys):
     """One that records none; one that deletes parts and runs, and one that would have to be started."""
     with pytest.raises(InputError, match="pair records no log, but an experiment needs a log"):
-        live_rig(logging_to(None))
+        live_rig(SimpleNamespace(name="pair", info=lambda: {"log": None}))
     file = tmp_path / "robot.yaml"
     file.write_text(ROBOT + "recording: {split: 1 min, keep: 10 min}\n")
     VirtualRobot(plan_of(file, duration_s=0.1), log=tmp_path / "log").run()
 
     with pytest.raises(InputError, match="pair deletes the oldest parts of its log"):
-        live_rig(logging_to(tmp_path / "log"))
+        live_rig(SimpleNamespace(name="pair", info=lambda: {"log": str(tmp_path / "log")}))
     monkeypatch.setattr(OwnRun, "__init__", lambda self, words: pytest.fail("a run was started"))
     assert main(["identify", str(file), "pan", "--yes"]) == 2
     assert f"{file} deletes the oldest parts of its log" in capsys.readouterr().err
@@ -190,16 +194,9 @@ def test_a_key_is_an_abort_with_the_rest_kept(robot, monkeypatch, capsys):
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-@pytest.fixture
-def hangup() -> Iterator[None]:
-    """Let SIGHUP end this process, as without nohup: where it is ignored an experiment goes on."""
-    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
-    yield
-    signal.signal(signal.SIGHUP, before)
-
-
-def test_a_run_of_its_own_frees_the_joint_and_ends_in_order_by_a_signal(place, capsys, hangup):
-    """With the robot of the other tests beside it: two runs of the same robot."""
+def test_a_run_of_its_own_frees_the_joint_and_ends_in_order_by_a_signal(robot):
+    """Beside the robot of the other tests. A run under nohup, which ignores SIGHUP, would go on."""
+    outer = signal.signal(signal.SIGHUP, signal.SIG_DFL)
     others = set(sockets())
 
     def signalled(joint):
@@ -213,14 +210,14 @@ def test_a_run_of_its_own_frees_the_joint_and_ends_in_order_by_a_signal(place, c
     assert ran.problems == ()
     assert set(sockets()) == others
     assert whole(ran.log), "it ended in order, at its rate"
-    assert signal.getsignal(signal.SIGHUP) is signal.SIG_DFL
+    assert signal.signal(signal.SIGHUP, outer) is signal.SIG_DFL
 
 
 def test_a_run_that_cannot_begin_says_why(place):
     (place / "gone.yaml").write_text(
         ROBOT.replace("port: sim", "port: /dev/no_such_port, adapter: {latency: 1 ms}")
     )
-    plays = Plays(lambda joint: iter([sine(joint)]))
+    plays = Plays(short)
     with pytest.raises(DxlrunError, match=r"^port /dev/no_such_port not found"):
         run_on_robot(plays, ["gone.yaml", "pan"], ExperimentOptions(yes=True))
     (place / "wrong.yaml").write_text(ROBOT.replace("rate: 100", "rat: 100").replace("id: 7", "id: 3"))
@@ -235,28 +232,24 @@ def test_a_part_without_a_result_is_one_more_sentence(place, capsys):
             raise InputError("too short")
 
     def gives_up(joint):
-        yield sine(joint, 100, 0.1)
+        yield from short(joint)
         raise DxlrunError("no two responses are alike")
 
-    ran = run_on_robot(Asks(gives_up), ["pair.yaml", "pan"], ExperimentOptions(virtual=True))
+    ran = run_on_robot(Asks(gives_up), ["pair.yaml", "pan"], VIRTUAL)
     assert (ran.result, ran.exit_code) == (None, 1)
     assert capsys.readouterr().err.splitlines()[-2:] == [
         "pair: the experiment ended early: no two responses are alike; 1 segment measured before",
         "pair: too short",
     ]
     with pytest.raises(InputError, match="too short"):
-        run_on_robot(
-            Asks(lambda joint: iter([sine(joint, 100, 0.1)])),
-            ["pair.yaml", "pan"],
-            ExperimentOptions(virtual=True),
-        )
+        run_on_robot(Asks(short), ["pair.yaml", "pan"], VIRTUAL)
 
 
 def test_real_servos_are_asked_for_and_counted_down(place, monkeypatch, capsys):
     """A simulated robot whose ports are taken for real ones."""
     monkeypatch.setattr(on_robot, "_real", lambda plan, options: True)
     monkeypatch.setattr(on_robot, "COUNTDOWN_S", (3, 0.1))
-    plays = Plays(lambda joint: iter([sine(joint, 100, 0.1)]))
+    plays = Plays(short)
     with open(os.devnull) as nothing:
         monkeypatch.setattr(sys, "stdin", nothing)
         ran = run_on_robot(plays, ["pair.yaml", "pan"], ExperimentOptions(virtual=True, yes=True))
@@ -271,7 +264,7 @@ def test_without_a_yes_no_run_is_started(place, monkeypatch, capsys, answer):
     """A run switches torque on, so the question comes before it; b"": Ctrl-C at it, None: no terminal."""
     monkeypatch.setattr(on_robot, "_real", lambda plan, options: True)
     logs, ran = set(place.glob("logs/*")), None
-    plays = Plays(lambda joint: iter([sine(joint, 100, 0.1)]))
+    plays = Plays(short)
     ours, theirs = os.openpty()
     with open(os.devnull if answer is None else theirs) as stdin:
         monkeypatch.setattr(sys, "stdin", stdin)
@@ -296,9 +289,9 @@ def test_without_a_yes_no_run_is_started(place, monkeypatch, capsys, answer):
         assert (ran.result, ran.log, ran.why, ran.exit_code) == (None, None, why, 130)
 
 
-SCRIPT = """
+SCRIPT = f"""
 import sys
-sys.path.insert(0, {root!r})
+sys.path.insert(0, {str(ROOT)!r})
 from tests.kit.experiments import Plays, sine
 from dxlrun_lab.commands.on_robot import run_on_robot
 def segments(joint):
@@ -317,10 +310,8 @@ sys.exit(ran.exit_code)
 @campaign(ci=0, night=10, release=50)
 def test_a_signal_at_any_time_leaves_nothing_of_the_run(place, number, chance):
     """In the start, in the middle, in the end, and when it is killed."""
-    before = set(place.glob("logs/*.mcap"))
-    script = SCRIPT.format(root=str(ROOT))
-    others = set(sockets())
-    words = [sys.executable, "-c", script]
+    before, others = set(place.glob("logs/*.mcap")), set(sockets())
+    words = [sys.executable, "-c", SCRIPT]
     process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert process.stdout is not None
     assert process.stdout.readline() == "ready\n"
@@ -360,15 +351,12 @@ def test_a_signal_in_the_middle_of_an_import_is_taken(monkeypatch):
         assert aborting() == "aborted by Ctrl-C"
 
 
-def test_an_experiment_whose_gateway_dies_says_that_nothing_was_put_back(robot, capsys):
+def test_an_experiment_whose_gateway_dies_says_that_nothing_was_put_back(running, robot, capsys):
     """The last test of the robot of the others, which goes on without one."""
 
     def kill_gateway(joint):
         yield sine(joint, 100, 0.2)
-        with socket.socket(socket.AF_UNIX) as probe:
-            probe.connect(str(sockets()["pair"]))
-            credentials = probe.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12)
-        os.kill(struct.unpack("=3i", credentials)[0], signal.SIGKILL)
+        os.kill(running.child("remote"), signal.SIGKILL)
         yield sine(joint, 100, 1.0)
 
     plays = Plays(kill_gateway)
