@@ -8,12 +8,10 @@ from __future__ import annotations
 import math
 import os
 import select
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
+from tests.kit.awaited import DEADLINE_S
 
 from dxlrun.errors import ProcessFault
 from dxlrun_lab.late_servos import LedgerTransaction
@@ -30,20 +28,14 @@ from exchange.wire import judge
 pytestmark = pytest.mark.long
 
 SECONDS = 0.2
-TIMEOUT_S = 60.0
-"""How long a test waits for what must come; it decides nothing but when to give up."""
 ALL = [kind.name for kind in HOSTS]
 
 
-def by_name(hosts: Any) -> dict[str, Any]:
-    return {one.host: one for one in hosts}
-
-
 @pytest.mark.parametrize("protocol", [1.0, 2.0])
-def test_every_host_exchanges_the_same_bytes_with_the_canned_responder(protocol: float) -> None:
+def test_every_host_exchanges_the_same_bytes_with_the_canned_responder(protocol: float):
     case = Case(protocol, 3)
     (found,) = bench_bus([("canned", case)], Settings(chosen_hosts(ALL), SECONDS)).cases
-    hosts = by_name(found.hosts)
+    hosts = {one.host: one for one in found.hosts}
     assert set(hosts) == set(ALL) if protocol == 2.0 else set(hosts) == {n for n in ALL if "fast" not in n}
     registers = Registers.of(case.plan(wire=False))
     assert hosts["ours"].sent_bytes == hosts["unrecorded"].sent_bytes
@@ -58,13 +50,13 @@ def test_every_host_exchanges_the_same_bytes_with_the_canned_responder(protocol:
     assert ours.sent_bytes + ours.received_bytes == budget.request_bytes + budget.reply_bytes
 
 
-def test_on_simulated_servos_the_ledger_says_how_many_bytes_an_exchange_has() -> None:
+def test_on_simulated_servos_the_ledger_says_how_many_bytes_an_exchange_has():
     case = Case(2.0, 2)
     settings = Settings(chosen_hosts(["ours", "rustypot"]), 2 * SECONDS)
     budget = case.plan(wire=True).buses[0].budget
     for _ in range(10):  # behind a lost reply a servo gets no goals, and machines stand still now and then
         (found,) = bench_bus([("simulated", case)], settings).cases
-        ours = by_name(found.hosts)["ours"]
+        ours = next(one for one in found.hosts if one.host == "ours")
         if not ours.lost:
             break
     assert (found.against, found.baud_rate) == ("simulated", 1_000_000)
@@ -72,7 +64,8 @@ def test_on_simulated_servos_the_ledger_says_how_many_bytes_an_exchange_has() ->
     assert ours.wire.wire_us == budget.wire_ns / 1e3
 
 
-def test_a_host_that_is_not_installed_is_left_out_and_said() -> None:
+def test_a_host_that_is_not_installed_is_left_out_and_the_core_is_given_back():
+    cores = os.sched_getaffinity(0)
     absent_host = HostKind("absent", "no_such_module_at_all", HOSTS[0].make)
     reported: list[tuple[str, float]] = []
     settings = Settings([absent_host, *chosen_hosts(["unrecorded"])], 0.05)
@@ -81,20 +74,11 @@ def test_a_host_that_is_not_installed_is_left_out_and_said() -> None:
     assert [one.host for one in found.cases[0].hosts] == ["unrecorded"]
     assert reported[-1] == ("canned: Protocol 2.0, 1 x XM430-W350", 1.0)
     assert b'"exchanges"' in to_json(found)
+    assert os.sched_getaffinity(0) == cores
 
 
-def test_the_core_is_given_back() -> None:
-    before = os.sched_getaffinity(0)
-    bench_bus([("canned", Case(2.0, 1))], Settings(chosen_hosts(["unrecorded"]), 0.02))
-    assert os.sched_getaffinity(0) == before
-
-
-# The canned responder
-
-
-@pytest.fixture
-def learned() -> tuple[Terminal, Callable[..., bytes]]:
-    """A responder that learned to answer a ping, then goals without a reply."""
+def test_the_responder_answers_after_so_many_bytes_and_is_a_servo_again_when_rehearsed():
+    """It learns to answer a ping, then goals without a reply."""
     terminal = Terminal(Case(1.0, 1).simulated("main"))
     host = os.open(terminal.path, os.O_RDWR | os.O_NOCTTY)
 
@@ -102,10 +86,10 @@ def learned() -> tuple[Terminal, Callable[..., bytes]]:
         """Write, let the responder take all of it, and hear an answer of some size."""
         left, heard = os.write(host, data), b""
         while left > 0:
-            assert select.select([terminal], [], [], TIMEOUT_S)[0]
+            assert select.select([terminal], [], [], DEADLINE_S)[0]
             left -= terminal.receive()
         while len(heard) < size:
-            assert select.select([host], [], [], TIMEOUT_S)[0], f"only {heard.hex(' ')} came"
+            assert select.select([host], [], [], DEADLINE_S)[0], f"only {heard.hex(' ')} came"
             heard += os.read(host, 1000)
         assert not select.select([host], [], [], 0)[0]
         return heard
@@ -118,32 +102,21 @@ def learned() -> tuple[Terminal, Callable[..., bytes]]:
     (first, last) = terminal.do("play")
     assert (first.count, len(first.reply)) == (6, 6)
     assert (last.count, last.reply) == (9, b"")
-    return terminal, say
-
-
-def test_the_responder_answers_after_so_many_bytes_whatever_they_are(learned: Any) -> None:
-    _, say = learned
-    assert say(b"12345") == b""
+    assert say(b"12345") == b"", "bytes count, whatever they are"
     answer = say(b"6", 6)
     assert answer[2] == 1
     assert say(b"123456789") == b""
     assert say(b"123456", 6) == answer
-
-
-def test_bytes_that_come_together_are_answered_together(learned: Any) -> None:
-    _, say = learned
-    assert len(say(b"?" * (6 + 9 + 6), 12)) == 12
-
-
-def test_the_responder_is_a_servo_again_when_it_is_rehearsed(learned: Any) -> None:
-    terminal, say = learned
-    say(b"123")
+    assert say(b"123456789") == b""
+    assert len(say(b"?" * (6 + 9 + 6), 12)) == 12, "what comes together is answered together"
+    assert say(b"123456789123") == b""
     terminal.do("rehearse")
     assert say(protocol1.ping(7)) == b""
     assert say(protocol1.ping(1), 6)[2] == 1
+    os.close(host)
 
 
-def test_a_responder_that_ended_is_an_error_and_is_not_waited_for() -> None:
+def test_a_responder_that_ended_is_an_error_and_is_not_waited_for():
     responder = CannedResponder([Case(1.0, 1).simulated("main")], -1)
     responder._process.kill()
     with pytest.raises(ProcessFault, match="the canned responder ended"):
@@ -151,34 +124,26 @@ def test_a_responder_that_ended_is_an_error_and_is_not_waited_for() -> None:
     responder.close()
 
 
-# The rounds, and the figures made of them
-
-
 class Made:
     """A host whose exchanges are lost on request."""
 
-    def __init__(self, lost: set[int]) -> None:
-        self.count = 0
-        self.lost = lost
+    def __init__(self, lost: set[int]):
+        self.count, self.lost = 0, lost
 
-    def start(self) -> None:
+    def start(self):
         pass
 
     def exchange(self) -> bool:
         self.count += 1
         return self.count not in self.lost
 
-    def recover(self) -> None:
-        pass
+    recover = close = start
 
     def sent(self) -> tuple[()]:
         return ()
 
-    def close(self) -> None:
-        pass
 
-
-def test_a_turn_with_a_lost_reply_counts_only_as_lost_and_the_host_is_mended() -> None:
+def test_a_turn_with_a_lost_reply_counts_only_as_lost_and_the_host_is_mended():
     recovered: list[str] = []
     hosts = {"good": Made(set()), "bad": Made({2, 6})}
     found = measure(hosts, 1e-6, most=5, recover=recovered.append)
@@ -193,29 +158,25 @@ def measured(walls_us: list[list[int]], processor_us: list[int]) -> Measured:
     return Measured(walls, [0] * len(walls), [each * 1000.0 for each in processor_us])
 
 
-def test_ratios_are_of_neighbouring_rounds_so_that_a_busy_moment_hits_both() -> None:
+def test_ratios_are_of_neighbouring_rounds_so_that_a_busy_moment_hits_both():
     ours = measured([[100, 110, 120], [1000, 1100, 1200]], [50, 500])
     theirs = measured([[200, 220, 240], [2000, 2200, 2400]], [100, 1000])
-    first, _ = host_figures({"ours": ours, "theirs": theirs}, {"ours": (1, 2), "theirs": (1, 2)}, {})
+    sizes = {"ours": (1, 2), "theirs": (1, 2)}
+    first, _ = host_figures({"ours": ours, "theirs": theirs}, sizes, {})
     assert first.wall_ratio == {"theirs": 0.5}
     assert first.processor_ratio == {"theirs": 0.5}
     assert (first.median_us, first.exchanges) == (560.0, 6)
-
-
-def test_a_host_without_a_whole_exchange_has_no_figures() -> None:
-    first, other = host_figures(
-        {"ours": measured([], []), "theirs": measured([[10]], [5])}, {"ours": (0, 0), "theirs": (1, 2)}, {}
-    )
-    assert math.isnan(first.median_us)
+    first, other = host_figures({"ours": measured([], []), "theirs": theirs}, sizes, {})
+    assert math.isnan(first.median_us), "no whole exchange"
     assert math.isnan(other.wall_ratio["ours"])
 
 
-def test_the_servos_lateness_is_taken_out_before_the_exchange_is_compared_with_its_wire() -> None:
+def test_the_servos_lateness_is_taken_out_before_the_exchange_is_compared_with_its_wire():
     found = wire_figures(np.array([1200.0, 1300.0]) * 1e3, np.array([100.0, 200.0]) * 1e3, 1e6)
     assert (found.beyond_us, found.late_us, found.ratio) == (1100.0, 150.0, 1.1)
 
 
-def test_a_transaction_belongs_to_the_exchange_that_waited_for_it() -> None:
+def test_a_transaction_belongs_to_the_exchange_that_waited_for_it():
     answered = [
         LedgerTransaction(handed_ns=150, late_ns=3, taken=10, given=20),
         LedgerTransaction(handed_ns=250, late_ns=4, taken=30, given=40),
@@ -227,7 +188,7 @@ def test_a_transaction_belongs_to_the_exchange_that_waited_for_it() -> None:
     assert (found.sent_bytes, found.received_bytes) == (20, 20)
 
 
-def test_both_goals_of_a_case_stay_within_the_servo_and_differ(tmp_path: Path) -> None:
+def test_both_goals_of_a_case_stay_within_the_servo_and_differ():
     registers = Registers.of(Case(1.0, 1).plan(wire=True))
     assert 0 < registers.ticks[0] < registers.ticks[1] < 1024
     assert [size for _, size in registers.values] == [2, 2, 2]

@@ -15,16 +15,13 @@ from exchange.command import main
 pytestmark = pytest.mark.long
 
 FEW = ("--servos", "1", "--protocol", "2.0", "--seconds", "0.05")
-FOLDER = Path(__file__).parent / "exchange"
+FOLDER = Path(__file__).parents[2] / "bench" / "exchange"
 
 
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (
-            ("--peers", "ours,theirs"),
-            "--peers: there is no theirs; there are ours, polled, unrecorded, sdk",
-        ),
+        (("--peers", "ours,theirs"), "--peers: there is no theirs; there are ours, polled, unrecorded, sdk"),
         (("--peers", ""), "--peers is empty; there are ours"),
         (("--protocol", "3.0"), "--protocol: there is no 3.0; there are 1.0, 2.0"),
         (("--against", "nothing"), "--against: there is no nothing; there are canned, simulated"),

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from pathlib import Path
-
 import pytest
 from tests.kit.made_logs import Cycle, Wire, made_log
 
@@ -37,14 +34,11 @@ def ledger(handed_late_us: int = 0, taken_late_us: int = 0, woke_us: int = 0) ->
     return found
 
 
-Waits = Callable[..., tuple[int, float, float]]
-
-
 @pytest.fixture
-def waits(tmp_path: Path) -> Waits:
+def waits(tmp_path):
     """Return overruns by servos, and how long the cycle that took more waited: read, idle, us."""
 
-    def waits(entries: list[LedgerEntry], **more: int) -> tuple[int, float, float]:
+    def waits(entries, **more):
         cycles = [Cycle(n, **(more if n == LATE else {})) for n in range(LATE + 1)]
         cycles.append(Cycle(LATE + 1 + GONE, skipped=GONE))
         woke = more.get("late", 0)
@@ -57,25 +51,29 @@ def waits(tmp_path: Path) -> Waits:
     return waits
 
 
-def test_a_reply_or_a_question_that_was_late_counts(waits: Waits) -> None:
-    assert waits(ledger(handed_late_us=17_000), read=22_000) == (1, 17_000, 0)
-    assert waits(ledger(taken_late_us=17_000), read=22_000) == (1, 17_000, 0)
+@pytest.mark.parametrize(
+    ("late", "cycle", "expected"),
+    [
+        ({"handed_late_us": 17_000}, {"read": 22_000}, (1, 17_000, 0)),
+        ({"taken_late_us": 17_000}, {"read": 22_000}, (1, 17_000, 0)),
+        # too long without the late reply: our own
+        ({}, {"update": 20_000}, (0, 0, 0)),
+        ({"woke_us": 16_000}, {"late": 16_000}, (0, 0, 0)),
+        ({"handed_late_us": 30_000}, {"read": 35_000, "update": 16_000}, (0, 30_000, 0)),
+    ],
+)
+def test_only_a_late_reply_or_question_counts(waits, late, cycle, expected):
+    assert waits(ledger(**late), **cycle) == expected
 
 
-def test_a_cycle_that_was_too_long_without_the_late_reply_is_our_own(waits: Waits) -> None:
-    assert waits(ledger(), update=20_000) == (0, 0, 0)
-    assert waits(ledger(woke_us=16_000), late=16_000) == (0, 0, 0)
-    assert waits(ledger(handed_late_us=30_000), read=35_000, update=16_000) == (0, 30_000, 0)
-
-
-def test_a_late_reply_in_the_idle_time_holds_up_the_wake_up(waits: Waits) -> None:
+def test_a_late_reply_in_the_idle_time_holds_up_the_wake_up(waits):
     at = 1_000_000 + LATE * PERIOD_US
     entries = ledger(woke_us=16_000)
     entries[2 * LATE : 2 * LATE] = [entry("in", at - 300), entry("out", at - 100, late_us=16_000)]
     assert waits(entries, late=16_000) == (1, 0, 15_900)
 
 
-def test_a_reply_that_was_asked_for_before_counts_only_as_long_as_it_was_waited_for(waits: Waits) -> None:
+def test_a_reply_that_was_asked_for_before_counts_only_as_long_as_it_was_waited_for(waits):
     entries = ledger()
     at = 1_000_000 + LATE * PERIOD_US
     entries[2 * LATE + 1] = entry("out", at - 6_000, late_us=8_000)  # handed over 2 ms after the cycle woke
@@ -83,7 +81,7 @@ def test_a_reply_that_was_asked_for_before_counts_only_as_long_as_it_was_waited_
     assert waits(entries, update=17_000) == (0, 2_000, 0)
 
 
-def test_bytes_that_wait_for_the_line_are_not_late() -> None:
+def test_bytes_that_wait_for_the_line_are_not_late():
     goals, question = bytes(100), bytes(10)
     sent = [(0, 100), (100_000, 10)]
     entries = [

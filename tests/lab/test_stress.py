@@ -51,6 +51,8 @@ def most_resident(process: int) -> int:
 
 def test_two_processes_load_the_machine_and_end_with_the_block(tmp_path):
     before = children(os.getpid())
+    with Stress(wanted=False) as load:
+        assert (load.text, load.ended(), children(os.getpid())) == ("", (), before)
     with Stress() as load:
         assert load.text == f"1 busy process, 1 allocating 0.016 GB and writing to {tmp_path}"
         started = children(os.getpid()) - before
@@ -75,12 +77,6 @@ def test_stress_ng_takes_the_place_of_both_where_it_is_installed(tmp_path):
             "--quiet", "--cpu", str(cores), "--vm", "2", "--vm-bytes", str(SMALL), "--hdd", "1",
             "--temp-path", str(tmp_path),
         ]  # fmt: skip
-
-
-def test_a_load_that_is_not_wanted_is_none():
-    before = children(os.getpid())
-    with Stress(wanted=False) as load:
-        assert (load.text, load.ended(), children(os.getpid())) == ("", (), before)
 
 
 def test_it_ends_when_the_process_that_entered_the_block_is_killed():

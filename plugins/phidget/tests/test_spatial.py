@@ -26,14 +26,13 @@ class Native:
     """libphidget22 as far as the library calls it: one unit with its handlers, and a record of all calls."""
 
     def __init__(self) -> None:
-        self.calls: list[tuple[str, tuple[Any, ...]]] = []
+        self.calls: dict[str, list[tuple[Any, ...]]] = {}
         self.handlers: dict[str, Any] = {}
         self.attached = True
 
     def __getattr__(self, name: str) -> Any:
         def function(*arguments: Any) -> int:
-            plain = tuple(getattr(each, "value", each) for each in arguments[1:])
-            self.calls.append((name, plain))
+            self.calls.setdefault(name, []).append(tuple(getattr(one, "value", one) for one in arguments[1:]))
             match name:
                 case "PhidgetSpatial_setOnSpatialDataHandler" | "Phidget_setOnDetachHandler":
                     self.handlers[name] = arguments[1]
@@ -49,20 +48,13 @@ class Native:
 
         return function
 
-    def called(self, name: str) -> list[tuple[Any, ...]]:
-        return [arguments for call, arguments in self.calls if call == name]
-
     def send(self, acceleration: list[float], rate: list[float], field: list[float]) -> None:
-        three = ctypes.c_double * 3
+        triples = [(ctypes.c_double * 3)(*each) for each in (acceleration, rate, field)]
         handler = self.handlers["PhidgetSpatial_setOnSpatialDataHandler"]
-        sent = threading.Thread(  # the library calls it in a thread of its own
-            target=lambda: handler(None, None, three(*acceleration), three(*rate), three(*field), 8.0)
-        )
+        # the library calls it in a thread of its own
+        sent = threading.Thread(target=handler, args=(None, None, *triples, 8.0))
         sent.start()
         sent.join()
-
-    def detach(self) -> None:
-        self.handlers["Phidget_setOnDetachHandler"](None, None)
 
 
 @pytest.fixture
@@ -110,69 +102,51 @@ def test_of_several_events_the_newest_counts_and_none_is_read_twice(
 ) -> None:
     monkeypatch.setattr("dxlrun_phidget.spatial._LOOK_S", 0.01)
     sensor = opened(magnetometer=False)
-    native.send([0.0] * 3, [1.0] * 3, [0.0] * 3)
-    native.send([0.0] * 3, [2.0] * 3, [0.0] * 3)
-    found = sample(sensor)
-    assert found is not None
-    assert found[3:] == pytest.approx([math.radians(2)] * 3)
+    for rate in (1.0, 2.0):
+        native.send([0.0] * 3, [rate] * 3, [0.0] * 3)
+    assert sample(sensor) == pytest.approx([0.0] * 3 + [math.radians(2)] * 3)
     assert sample(sensor) is None
 
 
-def test_a_value_that_is_not_known_is_nan(native: Native, opened: Callable[..., PhidgetSpatial]) -> None:
-    sensor = opened()
-    native.send([0.0] * 3, [0.0] * 3, [1e300] * 3)
-    found = sample(sensor)
-    assert found is not None
-    assert [math.isnan(value) for value in found] == [False] * 6 + [True] * 3
-
-
-def test_between_two_values_of_the_slower_magnetometer_its_last_one_stands(
+def test_an_unknown_field_is_nan_but_between_values_of_the_slower_magnetometer_its_last_one(
     native: Native, opened: Callable[..., PhidgetSpatial]
 ) -> None:
     now_ns = 0
     sensor = opened()
     sensor.context = SensorContext("imu", 10_000_000, lambda: now_ns, lambda text: None)
     for now_ns, field, expected in (  # noqa: B007  the clock reads it
+        (0, [1e300] * 3, [math.nan] * 3),
         (0, [0.5, 0.25, -0.25], [0.5e-4, 0.25e-4, -0.25e-4]),
         (100_000_000, [1e300] * 3, [0.5e-4, 0.25e-4, -0.25e-4]),
         (100_000_001, [1e300] * 3, [math.nan] * 3),
     ):
         native.send([0.0] * 3, [0.0] * 3, field)
-        found = sample(sensor)
-        assert found is not None
-        assert found[6:] == pytest.approx(expected, nan_ok=True)
+        assert sample(sensor) == pytest.approx([0.0] * 6 + expected, nan_ok=True)
 
 
 def test_the_unit_is_chosen_and_its_interval_is_set(
     native: Native, opened: Callable[..., PhidgetSpatial]
 ) -> None:
     opened(serial_number=597101, hub_port=2, attach_timeout="3 s")
-    assert native.called("Phidget_setDeviceSerialNumber") == [(597101,)]
-    assert native.called("Phidget_setHubPort") == [(2,)]
-    assert native.called("Phidget_openWaitForAttachment") == [(3000,)]
-    assert native.called("PhidgetSpatial_setDataInterval") == [(10,)]
+    assert native.calls["Phidget_setDeviceSerialNumber"] == [(597101,)]
+    assert native.calls["Phidget_setHubPort"] == [(2,)]
+    assert native.calls["Phidget_openWaitForAttachment"] == [(3000,)]
+    assert native.calls["PhidgetSpatial_setDataInterval"] == [(10,)]
     opened(period_ns=1_000_000)
-    assert native.called("PhidgetSpatial_setDataInterval")[-1] == (4,)  # the shortest that it can
+    assert native.calls["PhidgetSpatial_setDataInterval"][-1] == (4,)  # the shortest that it can
+    assert dxlrun_sensors() == {"phidget_spatial": PhidgetSpatial}
 
 
-def test_a_unit_that_is_not_there_is_one_sentence_and_can_come_later(
+def test_a_unit_that_is_not_there_can_come_later_and_one_that_is_unplugged_is_an_error(
     native: Native, opened: Callable[..., PhidgetSpatial]
 ) -> None:
     native.attached = False
     with pytest.raises(OSError, match=r"^Phidget Spatial 42: Timed Out$"):
         opened(serial_number=42)
-    native.attached = True
-    opened(serial_number=42)
-
-
-def test_a_unit_that_is_unplugged_is_an_error(native: Native, opened: Callable[..., PhidgetSpatial]) -> None:
-    sensor = opened()
-    native.detach()
+    native.attached, native.calls = True, {}
+    sensor = opened(serial_number=42)
+    native.handlers["Phidget_setOnDetachHandler"](None, None)
     with pytest.raises(OSError, match="detached"):
         sample(sensor)
     sensor.close()
-    assert len(native.called("Phidget_close")) == 1
-
-
-def test_the_hook_offers_it() -> None:
-    assert dxlrun_sensors() == {"phidget_spatial": PhidgetSpatial}
+    assert len(native.calls["Phidget_close"]) == 1

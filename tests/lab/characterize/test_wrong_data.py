@@ -35,12 +35,6 @@ def stepping(noise: float, *, lag_s: float = 0.03, delay_s: float = 0.02) -> lis
     return found
 
 
-def step_of(way: float, height: float) -> response.StepResponse:
-    return response.StepResponse(
-        np.arange(50) * 0.01, np.full(50, way), np.full(50, height), height, way, 0.0, TICK
-    )
-
-
 def test_noise_widens_the_interval_until_nothing_is_reported():
     quiet, noisy = (response.response(stepping(noise)) for noise in (0.0, 1.5 * TICK))
     assert quiet[0].value == pytest.approx(0.020, abs=0.002)
@@ -62,10 +56,14 @@ def test_a_figure_that_is_not_distinct_from_0_is_an_upper_bound(value, uncertain
 
 
 def test_estimators_refuse_nothing_and_motions_without_motion():
+    def steps(way: float, height: float) -> list[response.StepResponse]:
+        rows = np.full(50, way), np.full(50, height)
+        return [response.StepResponse(np.arange(50) * 0.01, *rows, height, way, 0.0, TICK)] * 8
+
     assert response.response([])[0].why.startswith("only 0 steps started at rest")
-    still = [step_of(0.0, 0.1)] * 8
+    still = steps(0.0, 0.1)
     assert "the joint moved by only 0 deg in steps of 5.7 deg" in response.response(still)[0].why
-    small = response.response([step_of(0.01, 0.01)] * 8)[0].why
+    small = response.response(steps(0.01, 0.01))[0].why
     assert "too small for positions in ticks of 0.088 deg; give a range of about 2 deg" in small
     found = speeds.speeds(still, 1.0, 5.0)
     assert {(figure.value, figure.why) for figure in found} == {(None, "the joint hardly moved")}

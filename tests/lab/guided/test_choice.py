@@ -37,16 +37,13 @@ def rig(tmp_path_factory):
     rig.close()
 
 
-def test_the_default_range_is_around_the_joint_and_within_its_limits(rig):
+def test_a_range_is_used_as_given_or_is_around_the_joint_within_its_limits(rig):
     (joint,) = situation_of(rig, ["narrow"], {}).joints
     assert math.degrees(joint.lower) == pytest.approx(-20, abs=0.1), "its limit is nearer than 30 deg"
     assert math.degrees(joint.upper) == pytest.approx(30, abs=0.1)
     assert joint.chosen.startswith("30 deg to each side of where it is, within its limits of -20")
     low, high = joint.inner
     assert joint.lower < low < joint.middle < high < joint.upper
-
-
-def test_a_range_is_used_as_it_is_given(rig):
     ranges = parse_ranges(["narrow=-10deg..0.5 rad", "wheel=-720 deg..720deg"])
     joints = situation_of(rig, ["wheel", "narrow"], ranges).joints
     assert [joint.name for joint in joints] == ["wheel", "narrow"], "as on the command line"

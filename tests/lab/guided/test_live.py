@@ -40,7 +40,7 @@ ROBOT = """\
 name: pair
 buses:
   main: {port: sim, protocol: 2.0, baud_rate: 1_000_000, return_delay_time: 0 us}
-loop: {rate: 100, tolerated_skips: 100 %}
+loop: {rate: 100, tolerated_skips: 100 %, scheduler: {policy: round_robin, priority: 31}}
 joints:
   pan: {bus: main, id: 3, model: XM430-W350, reference: 180 deg, direction: 1}
   tilt: {bus: main, id: 7, model: XM430-W350, reference: 180 deg, direction: -1}

@@ -19,6 +19,7 @@ from dxlrun_lab.identify.excitation import Room, excitation
 from dxlrun_lab.identify.fit import fit_run
 from dxlrun_lab.identify.joint_recording import measured
 from dxlrun_lab.identify.known_servo import Servo, servos_in
+from dxlrun_lab.identify.result import IdentifiedServo, KnownLoad, identified
 
 GRAVITY, INERTIA, ANGLE_DEG = 0.3, 0.005, 20.0
 """Of the load that the simulated servos move"""
@@ -49,6 +50,10 @@ class Run:
     def cycles(self) -> NDArray[np.void]:
         """A copy, to be spoilt."""
         return np.array(self.log.cycles)
+
+    def identified(self, cycles: NDArray[np.void], load: KnownLoad) -> IdentifiedServo:
+        data = measured(cycles, 0, self.servo)
+        return identified(data, fit_run(data), load, "test")
 
     def noisy(self, seed: int, *, position_ticks: float = 1.0, effort: float = 0.02) -> NDArray[np.void]:
         """Return the cycles with noise on what was measured: normal, and rounded to ticks."""

@@ -13,7 +13,7 @@ from dxlrun.channels.cycle import Torque
 from dxlrun.errors import InputError
 from dxlrun_lab.identify.fit import fit_run
 from dxlrun_lab.identify.joint_recording import measured
-from dxlrun_lab.identify.known_servo import Servo, servos_in
+from dxlrun_lab.identify.known_servo import Servo
 from dxlrun_lab.identify.result import KnownLoad, identified
 from dxlwire.modes import Mode
 
@@ -62,12 +62,6 @@ def test_a_run_that_does_not_determine_a_servo(xl330, spoil, rows, sentence):
     assert said.startswith(f"{xl330.servo.joint}: ")
 
 
-def test_a_run_without_voltage_takes_the_given_one(xl330):
-    cycles = xl330.cycles
-    cycles["voltage"] = np.nan
-    assert measured(cycles, 0, xl330.servo, voltage=5.0).voltage[0] == 5.0
-
-
 def lost_for_two_seconds(xl330: Any) -> tuple[Any, slice]:
     """Return the cycles of a run whose servo was lost in the middle, and the rows of that."""
     cycles = xl330.cycles
@@ -92,14 +86,15 @@ def test_two_seconds_of_a_lost_servo_are_skipped(xl330):
 
 @campaign(ci=0, night=1, release=1)
 def test_servo_that_was_lost_for_two_seconds_is_identified(xl330):
-    run = measured(lost_for_two_seconds(xl330)[0], 0, xl330.servo)
-    found = identified(run, fit_run(run), LOAD, "test")
+    found = xl330.identified(lost_for_two_seconds(xl330)[0], LOAD)
     assert found.motor.torque_constant == pytest.approx(0.38042, rel=0.08)
     assert any("were skipped" in note for note in found.notes)
 
 
-def test_a_servo_with_an_integral_part(xl330):
-    servo = xl330.servo
+def test_a_given_voltage_and_an_integral_part(xl330):
+    servo, cycles = xl330.servo, xl330.cycles
+    cycles["voltage"] = np.nan
+    assert measured(cycles, 0, servo, voltage=5.0).voltage[0] == 5.0
     declared = Servo(servo.joint, servo.table, servo.reference, servo.direction, {"position_i_gain": 100})
     with pytest.raises(InputError, match="position_i_gain 100, but the model has no integral gain"):
         measured(xl330.cycles, 0, declared)
@@ -108,8 +103,7 @@ def test_a_servo_with_an_integral_part(xl330):
 @campaign(ci=0, night=1, release=1)
 def test_an_ax_12_without_a_current_has_the_manuals_scale(record):
     run = record("AX-12A", 1.0, seconds=12.0)
-    data = measured(run.cycles, 0, run.servo)
-    found = identified(data, fit_run(data), KnownLoad(), "test")
+    found = run.identified(run.cycles, KnownLoad())
     assert found.scale == "manual"
     assert "the intervals exclude its error" in found.scale_sentence
     assert "viscous_friction" not in {value.name for value in found.values}
@@ -136,8 +130,3 @@ def test_a_load_that_cannot_be(fitted_xl330):
     unknown = identified(run, fits, KnownLoad(), "test")
     assert unknown.scale == "current"
     assert unknown.motor.inertia == pytest.approx(0.0069, rel=0.05)  # with the load's
-
-
-def test_a_log_without_the_joint(xl330):
-    with pytest.raises(InputError, match=r"no joint elbw; did you mean elbow"):
-        servos_in(xl330.log, ["elbw"])

@@ -59,18 +59,14 @@ def test_a_log_as_json(xl330, dxlrun):
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        ((ROBOT, "joint", "--virtual", "--duration", "2"), "2 s are too short"),
-        ((ROBOT, "joint", "--virtual", "--range", "joint=-3deg..3deg"), "is too small to identify"),
+        (("ROBOT", "joint", "--virtual", "--duration", "2"), "2 s are too short"),
+        (("ROBOT", "joint", "--virtual", "--range", "joint=-3deg..3deg"), "is too small to identify"),
+        (("ROBOT", "elbow", "--recorded", "LOG"), "--recorded evaluates a log"),
+        (("elbw", "--recorded", "LOG"), "no joint elbw; did you mean elbow"),
     ],
 )
-def test_refusals(words, sentence, dxlrun, here):
-    said = dxlrun("identify", *words)
+def test_refusals(words, sentence, xl330, dxlrun, here):
+    named = {"ROBOT": ROBOT, "LOG": xl330.log.path}
+    said = dxlrun("identify", *(named.get(word, word) for word in words))
     assert said.code == 2
     assert sentence in said.err
-
-
-def test_a_log_takes_joints_only(xl330, dxlrun):
-    said = dxlrun("identify", ROBOT, "elbow", "--recorded", xl330.log.path)
-    assert said.code == 2
-    assert "--recorded evaluates a log" in said.err
-    assert "no joint elbw" in dxlrun("identify", "elbw", "--recorded", xl330.log.path).err

@@ -8,16 +8,11 @@ are the default, and counts how often the intervals have the true value:
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
 import pytest
 from tests.kit.campaigns import campaign
 
 from dxlrun.description.joints.motor_file import motor_text, read_motor
-from dxlrun_lab.identify.fit import fit_run
-from dxlrun_lab.identify.joint_recording import measured
 from dxlrun_lab.identify.result import IdentifiedServo, KnownLoad, identified
 from dxlsim.motion.motor import Motor
 
@@ -25,12 +20,6 @@ pytestmark = pytest.mark.long
 
 GRAVITY, INERTIA = 0.3, 0.005
 LOAD = KnownLoad(INERTIA, GRAVITY)
-Record = Callable[..., Any]
-
-
-def result_of(run: Any, cycles: Any, load: KnownLoad = LOAD) -> IdentifiedServo:
-    data = measured(cycles, 0, run.servo)
-    return identified(data, fit_run(data), load, "test")
 
 
 def true_figures(motor: Motor) -> dict[str, float]:
@@ -61,7 +50,7 @@ def check_constants(found: IdentifiedServo, motor: Motor, within: float) -> None
 
 @campaign(ci=0, night=1, release=1)
 def test_an_mx_64_without_a_current_by_a_known_weight(mx64):
-    found = result_of(mx64, mx64.noisy(1))
+    found = mx64.identified(mx64.noisy(1), LOAD)
     assert (found.scale, found.friction_model) == ("load", "m3")
     check_constants(found, mx64.servo.built_in, 0.05)
     gain = next(value for value in found.values if value.name == "position_gain")
@@ -72,33 +61,26 @@ def test_an_mx_64_without_a_current_by_a_known_weight(mx64):
     assert found.held_out_rms < 1.3 * found.position_rms < 0.004
 
 
-@pytest.fixture(scope="module")
-def of_xl330(fitted_xl330):
-    return identified(*fitted_xl330, KnownLoad(INERTIA), "test")
-
-
-def test_an_xl330_by_its_current_alone(xl330, of_xl330):
-    found = of_xl330
+def test_an_xl330_by_its_current_alone_and_a_servo_simulated_from_its_motor_file(
+    xl330, fitted_xl330, record, tmp_path
+):
+    found = identified(*fitted_xl330, KnownLoad(INERTIA), "test")
     assert (found.scale, found.friction_model) == ("current", "m3")
     check_constants(found, xl330.servo.built_in, 0.05)
     assert found.motor.load.gravity == pytest.approx(GRAVITY, rel=0.05)
-
-
-def test_a_servo_simulated_from_the_motor_file_repeats_the_run(xl330, of_xl330, record, tmp_path):
-    found = of_xl330
-    path = tmp_path / "elbow.motor.yaml"
+    path, other = tmp_path / "elbow.motor.yaml", tmp_path / "other.yaml"
     path.write_text(motor_text(found.motor, found.uncertainty))
     read = read_motor(path)
     assert read.motor.torque_constant == pytest.approx(found.motor.torque_constant, rel=1e-5)
     assert read.uncertainty["inertia"] == pytest.approx(found.uncertainty["inertia"], rel=1e-5)
-    again = record("XL330-M288", 2.0, motor=f"motor: {path}")
-    apart = again.log.cycles["position"][:, 0] - xl330.log.cycles["position"][:, 0]
-    assert np.sqrt(np.mean(np.square(apart))) < 0.006
-    (tmp_path / "other.yaml").write_text(
-        path.read_text().replace(f"inertia: {found.motor.inertia:.6g}", "inertia: 0.006")
+    inertia = f"inertia: {found.motor.inertia:.6g}"
+    assert inertia in path.read_text()
+    other.write_text(path.read_text().replace(inertia, "inertia: 0.006"))
+    same, apart = (
+        record("XL330-M288", 2.0, motor=f"motor: {file}").cycles["position"] - xl330.cycles["position"]
+        for file in (path, other)
     )
-    other = record("XL330-M288", 2.0, motor=f"motor: {tmp_path / 'other.yaml'}")
-    apart = other.log.cycles["position"][:, 0] - xl330.log.cycles["position"][:, 0]
+    assert np.sqrt(np.mean(np.square(same))) < 0.006
     assert np.sqrt(np.mean(np.square(apart))) > 0.02
 
 
@@ -109,7 +91,7 @@ def test_a_servo_simulated_from_the_motor_file_repeats_the_run(xl330, of_xl330, 
 )
 def test_sixty_noisy_seconds_of_each_model(record, model, protocol, rate):
     run = record(model, protocol, seconds=60.0, rate=rate)
-    check_constants(result_of(run, run.noisy(3)), run.servo.built_in, 0.05)
+    check_constants(run.identified(run.noisy(3), LOAD), run.servo.built_in, 0.05)
 
 
 @campaign(ci=0, night=8, release=40)
@@ -117,7 +99,7 @@ def test_intervals_have_the_true_value_as_often_as_they_claim(mx64, xl330, amoun
     inside = {}
     for seed in range(int(amount)):
         for run in (mx64, xl330):
-            found = result_of(run, run.noisy(100 + seed, position_ticks=3.0, effort=0.05))
+            found = run.identified(run.noisy(100 + seed, position_ticks=3.0, effort=0.05), LOAD)
             true = true_figures(run.servo.built_in)
             for value in found.values:
                 if value.name in true and value.half is not None:

@@ -51,34 +51,25 @@ class Ran:
         return measure_tracking(self.log, self.setup, self.desired, self.ledger)
 
 
-def at_random() -> Iterator[int]:
-    """Yield delays of up to three periods, at three of ten wake-ups or so."""
+def delays(kind: str) -> Iterator[int]:
+    """Yield how late each wake-up is made: `none`, `random` up to three periods, or `once`, wake-up 400."""
     chance = random.Random(1)
-    while True:
-        yield (chance.random() < 0.3) * chance.randrange(3 * PERIOD_NS)
+    for number in itertools.count():
+        if kind == "random":
+            yield (chance.random() < 0.3) * chance.randrange(3 * PERIOD_NS)
+        else:
+            yield 5 * PERIOD_NS // 2 * (kind == "once" and number == 400)
 
 
-def once() -> Iterator[int]:
-    """Yield one delay of two and a half periods, at wake-up 400."""
-    return (5 * PERIOD_NS // 2 * (number == 400) for number in itertools.count())
-
-
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def runs(tmp_path_factory):
-    """Return what gives the run of a set-up with such delays: `none`, `random`, `once`; each is made once."""
+    """Return what gives the run of a set-up with such delays, or of so many cycles; each is made once."""
 
     @cache
-    def ran(setup, delay):
-        late = {"none": lambda: itertools.repeat(0), "random": at_random, "once": once}[delay]()
-        return _run(setup, late, tmp_path_factory.mktemp(setup))
+    def ran(setup, delay, cycles=0):
+        return _run(setup, delays(delay), tmp_path_factory.mktemp(setup), cycles)
 
     return ran
-
-
-@pytest.fixture
-def stopped(tmp_path):
-    """Return what runs only so many cycles in a set-up."""
-    return lambda setup, cycles: _run(setup, itertools.repeat(0), tmp_path, cycles)
 
 
 @pytest.fixture
@@ -93,7 +84,7 @@ def motion_file(tmp_path):
     return write
 
 
-def _run(name: str, late_ns: Iterator[int], folder: Path, cycles: int = 0) -> Ran:
+def _run(name: str, late_ns: Iterator[int], folder: Path, cycles: int) -> Ran:
     (setup,) = chosen([name])
     motion = folder / "short.yaml"
     motion.write_text(MOTION.format(duration="1 s", samples=50))

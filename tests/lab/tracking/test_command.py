@@ -6,7 +6,7 @@ import json
 import os
 import re
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
@@ -23,7 +23,7 @@ from dxlrun_analysis.replay import replay_log
 from dxlrun_lab.stress import Stress
 from dxlrun_lab.tracking import setups, tracking_experiment
 from dxlrun_lab.tracking.figures import drawings
-from dxlrun_lab.tracking.setups import SETUPS, Setup
+from dxlrun_lab.tracking.setups import SETUPS
 from dxlrun_lab.tracking.tracking_experiment import TrackingExperiment
 from dxlrun_lab.tracking.tracking_report import page, table
 
@@ -83,30 +83,24 @@ def test_the_page_has_the_table_and_a_figure_a_setup_with_the_same_axes(runs):
     assert ">1.4</text>" in figures[0]
     assert ">1.4</text>" in figures[2]
     assert ">1.4</text>" not in ET.tostring(alone, encoding="unicode")
-
-
-def test_the_table_of_all_setups_fits_a_terminal(runs):
-    """One column a set-up; a table that does not fit would become paragraphs."""
-    tracked = runs("loop-normal", "random").measured.tracked
+    # one column a set-up; a table that does not fit a terminal would become paragraphs
+    tracked = measured[1].tracked
     shown = fitted(table([replace(tracked, setup=one.name, late_by_bus_us=2e5) for one in SETUPS]), 80)
     heads, *_ = ("".join(text for text, _ in line) for line in shown)
     assert all(one.name in heads for one in SETUPS)
 
 
-# Runs that end otherwise
-
-
 @pytest.fixture
 def pretend(monkeypatch):
-    """Return what lets runs end in this way; gives the plans that are run."""
+    """Return what lets runs end in this way, each with the log of a run; gives the plans that are run."""
 
-    def pretend(summaries):
-        plans = []
-        left = iter(summaries)
+    def pretend(*ends):
+        plans, left = [], iter(ends)
 
         def run_robot(plan, *_):
             plans.append(plan)
-            return next(left)
+            code, run, *sentences = next(left)
+            return RunSummary(code, "", 1, 0, 1.0, tuple(sentences), log=str(run.log.path))
 
         monkeypatch.setattr(tracking_experiment, "run_robot", run_robot)
         monkeypatch.setattr(setups, "missing_priority", lambda scheduler: "")
@@ -115,13 +109,10 @@ def pretend(monkeypatch):
     return pretend
 
 
-def summary(code: int, log: Path | None, *sentences: str) -> RunSummary:
-    return RunSummary(code, "", 1, 0, 1.0, sentences, log=None if log is None else str(log))
-
-
-def log_of(runs: Make, setup: Setup) -> Path:
-    """Return the log of a run with a set-up's schedule; on virtual time the scheduler is all the same."""
-    return Path(runs(f"{setup.name.partition('-')[0]}-normal", "none").log.path)
+def all_ended(runs: Make, named: Sequence[str] = ()) -> list[tuple[int, Any]]:
+    """Return ends of runs by their schedule; on virtual time the scheduler is all the same."""
+    names = named or [one.name for one in SETUPS]
+    return [(0, runs(f"{name.partition('-')[0]}-normal", "none")) for name in names]
 
 
 def run_short(dxlrun: Make, runs: Make, *words: object) -> Any:
@@ -130,7 +121,7 @@ def run_short(dxlrun: Make, runs: Make, *words: object) -> Any:
 
 
 def test_every_setup_has_its_schedule_and_scheduler(dxlrun, runs, pretend):
-    plans = pretend([summary(0, log_of(runs, one)) for one in SETUPS])
+    plans = pretend(*all_ended(runs))
     said = run_short(dxlrun, runs)
     assert said.code == 0
     assert [(plan.loop.schedule, plan.loop.scheduler.policy) for plan in plans] == [
@@ -149,19 +140,18 @@ def test_the_commands_of_the_pages_are_understood(dxlrun, runs, pretend, monkeyp
     monkeypatch.setattr("dxlrun_lab.stress.Stress", lambda *, wanted: Stress(wanted=False))
     monkeypatch.setattr("dxlrun_lab.tracking.tracking_report.page", lambda result: "a page")
     for words in commands_of(page, "experiment tracking"):
-        plans = pretend([summary(0, log_of(runs, one)) for one in SETUPS])
-        named = words[words.index("--setups") + 1].split(",") if "--setups" in words else SETUPS
+        named = words[words.index("--setups") + 1].split(",") if "--setups" in words else ()
+        plans = pretend(*all_ended(runs, named))
         assert dxlrun(*words).code == 0
-        assert len(plans) == len(named)
+        assert len(plans) == len(named or SETUPS)
         assert {plan.buses[0].port for plan in plans} == {
             "/dev/ttyUSB0" if any(word.startswith("port:=") for word in words) else "sim"
         }
 
 
-def test_an_interrupt_keeps_what_was_measured(dxlrun, runs, stopped, pretend, monkeypatch):
+def test_an_interrupt_keeps_what_was_measured(dxlrun, runs, pretend, monkeypatch):
     monkeypatch.setattr("dxlrun_lab.tracking.tracking_report.page", lambda result: "a page")
-    whole, part = runs("sequential-normal", "none").log.path, stopped("loop-normal", 480).log.path
-    plans = pretend([summary(0, whole), summary(130, part)])
+    plans = pretend((0, runs("sequential-normal", "none")), (130, runs("loop-normal", "none", 480)))
     said = run_short(dxlrun, runs, "--report", "page.html")
     assert said.code == 130
     assert len(plans) == 2
@@ -172,12 +162,11 @@ def test_an_interrupt_keeps_what_was_measured(dxlrun, runs, stopped, pretend, mo
 
 
 def test_a_termination_between_two_runs_keeps_what_was_measured(dxlrun, runs, pretend, monkeypatch):
-    logs = [runs(setup, "none").log.path for setup in ("sequential-normal", "loop-normal")]
-    pretend([summary(0, log) for log in logs])
+    pretend(*all_ended(runs, NORMAL.split(",")))
     read = tracking_experiment.read_log
 
     def terminated(path):
-        if path == str(logs[1]):
+        if path == str(runs("loop-normal", "none").log.path):
             os.kill(os.getpid(), signal.SIGTERM)
         return read(path)
 
@@ -189,13 +178,9 @@ def test_a_termination_between_two_runs_keeps_what_was_measured(dxlrun, runs, pr
     assert signal.getsignal(signal.SIGTERM) == before
 
 
-def test_a_run_that_fails_ends_in_a_sentence_and_the_others_follow(dxlrun, runs, stopped, pretend):
-    plans = pretend(
-        [
-            summary(1, stopped("sequential-normal", 480).log.path, "the loop stood still"),
-            summary(0, runs("loop-normal", "none").log.path),
-        ]
-    )
+def test_a_run_that_fails_ends_in_a_sentence_and_the_others_follow(dxlrun, runs, pretend):
+    failed = 1, runs("sequential-normal", "none", 480), "the loop stood still"
+    plans = pretend(failed, (0, runs("loop-normal", "none")))
     said = run_short(dxlrun, runs, "--setups", NORMAL)
     assert said.code == 1
     assert len(plans) == 2
@@ -219,17 +204,14 @@ def test_the_load_is_there_while_a_run_is_measured(runs, pretend, monkeypatch):
         def ended(self):
             return ("the load ended",)
 
-    pretend([summary(0, ran.log.path)])
+    pretend((0, ran))
     monkeypatch.setattr(tracking_experiment, "read_log", lambda path: steps.append("measured") or ran.log)
     one = tracking_experiment.run_experiment(ran.plan, ran.desired, SETUPS[1:2], Load(), None)
     assert steps == ["loaded", "free", "measured"]
     assert one.measured[0].tracked.remarks == ("the load ended",)
 
 
-# Wrong words
-
-
-def test_without_the_right_to_real_time_one_sentence_says_so_beforehand(dxlrun, runs, monkeypatch):
+def test_without_the_right_to_real_time_only_normal_setups_are_run(dxlrun, runs, pretend, monkeypatch):
     monkeypatch.setattr(realtime_grants, "highest_priority", lambda: 0)
     said = run_short(dxlrun, runs)
     assert (said.code, said.out) == (2, "")
@@ -238,9 +220,5 @@ def test_without_the_right_to_real_time_one_sentence_says_so_beforehand(dxlrun, 
     )
     assert realtime_grants.allow("rtprio", 32) in said.err
     assert f"--setups {NORMAL}" in said.err
-
-
-def test_without_that_right_the_normal_setups_are_measured(dxlrun, runs, pretend, monkeypatch):
-    pretend([summary(0, runs(name, "none").log.path) for name in NORMAL.split(",")])
-    monkeypatch.setattr(realtime_grants, "highest_priority", lambda: 0)
+    pretend(*all_ended(runs, NORMAL.split(",")))
     assert run_short(dxlrun, runs, "--setups", NORMAL).code == 0

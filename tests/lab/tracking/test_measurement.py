@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -23,7 +21,20 @@ ROBOT = Path(__file__).parents[3] / "robots" / "single_joint.yaml"
 ACTIVE = {"position_trajectory": "false", "posvel_trajectory": "true"}
 PERIOD_NS = 3_125_000
 SEQUENTIAL, LOOP = "sequential-normal", "loop-normal"
-Make = Callable[..., Any]
+
+
+@pytest.fixture
+def waited(monkeypatch):
+    """Return what makes cycles wait for simulated servos, ns: in their read, and in the idle time."""
+
+    def waited(rows, read=None, idle=None):
+        found = np.zeros((2, rows), np.int64)
+        for times, given in zip(found, (read, idle), strict=True):
+            for cycle, ns in (given or {}).items():
+                times[cycle] = ns
+        monkeypatch.setattr(motion_evaluation, "waits_for_servos", lambda log, ledger: tuple(found))
+
+    return waited
 
 
 def test_the_sequential_sender_ends_late_by_exactly_the_sum_of_its_start_delays(runs):
@@ -69,6 +80,9 @@ def test_without_delays_both_send_the_same(runs):
     assert (one.late_cycles, one.max_late_us, one.silent_cycles) == (0, 0.0, 0)
     assert (one.rms_rad, one.worst_rad) == (other.rms_rad, other.worst_rad)
     assert 0.001 < one.rms_rad < one.worst_rad < 0.2
+    ran = runs(LOOP, "none")
+    one = measure_tracking(ran.log, ran.setup, ran.desired, None).tracked
+    assert (one.late_by_bus_us, one.drift_by_bus_ns) == (None, None), "a real bus has no ledger"
 
 
 def test_the_error_is_that_of_the_moment_of_the_reading(runs):
@@ -93,7 +107,7 @@ def test_one_late_wake_up_is_one_late_cycle(runs, setup):
     assert late_s == pytest.approx(2.5 * PERIOD_NS / 1e9)
 
 
-def test_a_cycle_after_one_that_took_too_long_is_late(runs, monkeypatch):
+def test_a_cycle_after_one_that_took_too_long_is_late(runs, waited):
     """As if the read of a cycle had taken 2.2 periods: the next one begins after two skipped periods."""
     ran = runs(LOOP, "none")
     kept = ~np.isin(ran.log.cycles["cycle"], (401, 402))
@@ -105,17 +119,13 @@ def test_a_cycle_after_one_that_took_too_long_is_late(runs, monkeypatch):
     one = ran.measured.tracked
     assert (one.late_cycles, one.max_late_us) == (1, 2 * PERIOD_NS / 1e3)
     # a simulated servo may have caused what the cycle took beyond its period, not what was skipped besides
-    in_read, in_idle = np.zeros((2, len(cycles)), np.int64)
-    in_read[after - 1] = 3 * PERIOD_NS
-    monkeypatch.setattr(motion_evaluation, "waits_for_servos", lambda log, ledger: (in_read, in_idle))
+    waited(len(cycles), read={after - 1: 3 * PERIOD_NS})
     assert ran.measured.tracked.late_by_bus_us == 1.2 * PERIOD_NS / 1e3
 
 
-def test_what_the_simulated_bus_was_late_is_taken_off(runs, monkeypatch):
+def test_what_the_simulated_bus_was_late_is_taken_off(runs, waited):
     ran = runs(SEQUENTIAL, "once")
-    in_read, in_idle = np.zeros((2, len(ran.log.cycles)), np.int64)
-    in_read[350], in_idle[400], in_idle[500] = 900_000, 1_500_000, 7_000_000
-    monkeypatch.setattr(motion_evaluation, "waits_for_servos", lambda log, ledger: (in_read, in_idle))
+    waited(len(ran.log.cycles), read={350: 900_000}, idle={400: 1_500_000, 500: 7_000_000})
     one = ran.measured.tracked
     assert one.drift_ns == 7_812_500
     assert one.drift_by_bus_ns == 1_500_000  # nothing of 350 and 500: no cycle was late by it
@@ -124,38 +134,27 @@ def test_what_the_simulated_bus_was_late_is_taken_off(runs, monkeypatch):
     assert (one.late_cycles, one.max_late_us) == (1, 6_312.5)
 
 
-def test_what_the_bus_was_late_before_the_first_pose_is_no_drift(runs, monkeypatch):
+def test_what_the_bus_was_late_before_the_first_pose_is_no_drift(runs, waited):
     """The duration counts from when the first pose was sent, however late that was."""
     ran = runs(SEQUENTIAL, "random")
     cycles = ran.log.cycles.copy()
     cycles["scheduled_ns"][320] -= PERIOD_NS
     ran = replace(ran, log=replace(ran.log, cycles=cycles))
-    in_read, in_idle = np.zeros(len(cycles), np.int64), np.full(len(cycles), 10 * PERIOD_NS)
-    monkeypatch.setattr(motion_evaluation, "waits_for_servos", lambda log, ledger: (in_read, in_idle))
+    waited(len(cycles), idle=dict.fromkeys(range(len(cycles)), 10 * PERIOD_NS))
     one = ran.measured.tracked
     assert one.drift_by_bus_ns == one.drift_ns > 0
     assert (one.own_drift_ns, one.late_cycles) == (0, 0)
     assert one.late_by_bus_us * 1000 == pytest.approx(one.drift_ns + ran.injected_ns[320] + PERIOD_NS)
 
 
-def test_a_real_bus_has_no_ledger(runs):
-    ran = runs(LOOP, "none")
-    one = measure_tracking(ran.log, ran.setup, ran.desired, None).tracked
-    assert (one.late_by_bus_us, one.drift_by_bus_ns) == (None, None)
-
-
 @pytest.mark.parametrize("setup", [SEQUENTIAL, LOOP])
-def test_a_run_that_was_stopped_is_measured_as_far_as_it_came(stopped, setup):
-    one = stopped(setup, 480).measured.tracked
+def test_a_run_that_was_stopped_is_measured_as_far_as_it_came(runs, setup):
+    assert runs(setup, "none", 100).measured is None, "it ended before the motion"
+    one = runs(setup, "none", 480).measured.tracked
     assert not one.ended
     assert one.drift_ns is one.own_drift_ns is None
     assert one.cycles == pytest.approx(160, abs=3)
     assert one.rms_rad > 0
-
-
-@pytest.mark.parametrize("setup", [SEQUENTIAL, LOOP])
-def test_a_run_that_ended_before_the_motion_has_no_numbers(stopped, setup):
-    assert stopped(setup, 100).measured is None
 
 
 # The desired motion
@@ -174,29 +173,16 @@ def test_between_samples_the_desired_motion_is_the_formula(motion_file):
     assert behind == pytest.approx(0.5 * (math.sin(6) - math.sin(12)))
 
 
-TWO_PARTS = """\
-name: two
-motions:
-  - controller: posvel_trajectory
-    points: [{time: 1 s, joints: {joint: {position: 0 rad, velocity: 0 rad/s}}}]
-  - controller: posvel_trajectory
-    start: 3 s
-    points: [{time: 1 s, joints: {joint: {position: 0 rad, velocity: 0 rad/s}}}]
-"""
-ONE_POINT = """\
-name: one
-motions:
-  - controller: posvel_trajectory
-    points: [{time: 1 s, joints: {joint: {position: 0 rad, velocity: 0 rad/s}}}]
-"""
+PART = "  - controller: posvel_trajectory\n    points: [{time: 1 s, joints: {joint: {position: 0 rad}}}]\n"
 
 
 @pytest.mark.parametrize(
-    ("motion", "sentence"), [(TWO_PARTS, "has 2 parts"), (ONE_POINT, "has fewer than two positions")]
+    ("parts", "sentence"),
+    [(f"{PART}{PART}    start: 3 s\n", "has 2 parts"), (PART, "has fewer than two positions")],
 )
-def test_a_motion_that_cannot_be_compared_is_refused(tmp_path, motion, sentence):
+def test_a_motion_that_cannot_be_compared_is_refused(tmp_path, parts, sentence):
     file = tmp_path / "motion.yaml"
-    file.write_text(motion)
+    file.write_text(f"name: refused\nmotions:\n{parts}")
     plan = compile_files(ROBOT, ACTIVE, [file]).plan
     with pytest.raises(InputError, match=sentence):
         desired_motion(file, plan)
