@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import pytest
-from tests.kit.robot_cases import CASES, Case, cases
-
-ALL = [
-    pytest.param(case, id=f"{case.place}: {' '.join(case.changes)}")
-    for path in sorted(CASES.glob("*.txt"))
-    for case in cases(path.stem)
-]
+from tests.kit.cases import TextCase, case_parameters
+from tests.kit.robot_cases import check_case
+from tests.kit.robots import CASES, whole_text
 
 
 @pytest.mark.usefixtures("part_plugins")
-@pytest.mark.parametrize("case", ALL)
-def test_case_has_its_problems_and_its_facts(case: Case) -> None:
-    if any("mujoco" in text for text in (case.text, *case.changes)):
+@pytest.mark.parametrize("case", case_parameters(CASES))
+def test_case_has_its_problems_and_its_facts(case: TextCase) -> None:
+    texts = (whole_text(case.head), case.name, *(line.text for line in case.lines))
+    if any("mujoco" in text for text in texts):
         pytest.importorskip("mujoco")
-    case.check()
+    check_case(case)

@@ -8,8 +8,8 @@ from pathlib import Path
 import msgspec
 import pytest
 from msgspec.structs import replace
-from tests.kit.robot_cases import CASES, compile_cases
-from tests.kit.robots import PAIR, compile_text, problems_in, robot_text, whole_text
+from tests.kit.robot_cases import compile_cases
+from tests.kit.robots import CASES, PAIR, compile_text, problems_in, robot_text, whole_text
 
 from dxlrun.compile.buses import slowest_period_ns
 from dxlrun.compile.policies import MARGIN_NS

@@ -5,27 +5,23 @@ from __future__ import annotations
 import re
 
 import pytest
+from tests.kit.cases import TextCase, case_parameters, read_cases
 from tests.kit.rigs import make_x, start_rig
-from tests.kit.servo_cases import CASES, Case, read_cases
+from tests.kit.servo_cases import CASES, Case
 
 from dxlrun.dynamixel.servo.checks import CHECKS
 
-ALL = [case for path in sorted(CASES.glob("*.txt")) for case in read_cases(path)]
 
-
-@pytest.mark.parametrize("case", [pytest.param(case, id=f"{case.place}: {case.title}") for case in ALL])
-def test_runtime_does_and_reports_what_the_case_says(case: Case) -> None:
-    case.check()
+@pytest.mark.parametrize("case", case_parameters(CASES))
+def test_runtime_does_and_reports_what_the_case_says(case: TextCase) -> None:
+    Case(case).check()
 
 
 def test_every_check_of_the_start_has_a_case() -> None:
     """A check that never fails guards nothing."""
-    refused = [
-        case for case in ALL if any(re.match("=> (refused|register differs)", line) for _, line in case.lines)
-    ]
-    changed = {
-        name for case in refused for _, line in case.lines for name in re.findall(r"(\w+) -?\d+", line)
-    }
+    texts = ["\n".join(line.text for line in case.lines) for case in read_cases(CASES)]
+    refused = [one for one in texts if re.search("^=> (refused|register differs)", one, re.MULTILINE)]
+    changed = {name for one in refused for name in re.findall(r"(\w+) -?\d+", one)}
     # overheating is in the error byte, `firmware 44` lacks an item; test_hardware_errors.py has the Y series
     assert {check.item for check in CHECKS} <= changed | {"status_error", "firmware_version", "error_code"}
 

@@ -3,22 +3,22 @@
 from functools import partial
 
 import pytest
+from tests.kit.cases import case_parameters
 from tests.kit.line_faults import delay_next
 from tests.kit.plans import distinct_tables
-from tests.kit.servo_cases import CASES, read_cases
+from tests.kit.servo_cases import CASES
 from tests.kit.tool_cases import RATE, WRITE, ToolCase, ToolRig
 
 from dxlrun.dynamixel.tools import servo_backup
 from dxlrun.errors import ServoFault
 from dxlsim.simulation_plan import ServoConfig
 
-ALL = [case for path in CASES.with_name("tool_cases").glob("*.txt") for case in read_cases(path, ToolCase)]
 MODELS = pytest.mark.parametrize("model", ["AX-12A", "MX-64", "XM430-W350", "XL-320"])
 
 
-@pytest.mark.parametrize("case", [pytest.param(case, id=f"{case.place}: {case.title}") for case in ALL])
+@pytest.mark.parametrize("case", case_parameters(CASES.with_name("tool_cases")))
 def test_tool_does_and_reports_what_the_case_says(case):
-    case.check()
+    ToolCase(case).check()
 
 
 @pytest.fixture

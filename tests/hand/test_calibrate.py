@@ -6,18 +6,19 @@ import os
 from pathlib import Path
 
 import pytest
-from tests.kit.dialogues import Dialogue, Told, check_dialogue, dialogues
+from tests.kit.cases import TextCase, case_parameters, read_head
+from tests.kit.dialogues import Dialogue, check_dialogue
 
 from dxlrun.compile.robot_compiler import compile_files
 from dxlrun.dynamixel.tools.tool_line import TunablePort
 from dxlwire.port.serial_open import open_serial
 
 TEXT = Path(__file__).parent / "dialogues" / "calibrate.txt"
-ROBOT, SERVOS = TEXT.read_text().partition("====\n")[0].split("----\n")
+ROBOT, SERVOS = read_head(TEXT).split("----\n")
 
 
-@pytest.mark.parametrize("told", [*dialogues(TEXT)])
-def test_dialogue(tmp_path: Path, capsys: pytest.CaptureFixture[str], told: Told) -> None:
+@pytest.mark.parametrize("told", case_parameters(TEXT))
+def test_dialogue(tmp_path: Path, capsys: pytest.CaptureFixture[str], told: TextCase) -> None:
     check_dialogue(tmp_path, told, lambda: capsys.readouterr().err)
 
 

@@ -10,7 +10,8 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import pytest
-from tests.kit.dialogues import Told, check_dialogue, dialogues
+from tests.kit.cases import TextCase, case_parameters, read_head
+from tests.kit.dialogues import check_dialogue
 from tests.kit.hands import HandLine, Script, interrupt, written
 
 from dxlrun.description.reading import read_robot
@@ -23,12 +24,12 @@ from dxlsim.simulation_plan import ServoConfig
 from dxlsim.virtual_ports import VirtualPorts
 
 TEXT = Path(__file__).parent / "dialogues" / "setup.txt"
-ROBOT = TEXT.read_text().partition("----\n")[0]
+ROBOT = read_head(TEXT).partition("----\n")[0]
 NEW = (ServoConfig(1, "XL430-W250", math.radians(150)), ServoConfig(1, "XM430-W350", math.radians(200)))
 
 
-@pytest.mark.parametrize("told", [*dialogues(TEXT)])
-def test_dialogue(tmp_path: Path, capsys: pytest.CaptureFixture[str], told: Told) -> None:
+@pytest.mark.parametrize("told", case_parameters(TEXT))
+def test_dialogue(tmp_path: Path, capsys: pytest.CaptureFixture[str], told: TextCase) -> None:
     check_dialogue(tmp_path, told, lambda: capsys.readouterr().err)
 
 

@@ -1,7 +1,7 @@
 """Dialogues in text: a hand answers the questions of `dxlrun calibrate` and `dxlrun setup`, and turns servos.
 
-A text is a robot file, after `----` its servos (`1 XL430-W250 at 150`: ID, model and angle, deg), and after
-`====` cases. A case is a sentence and lines:
+The texts have the form of `tests/kit/cases.py`. The head is a robot file, and after `----` its servos
+(`1 XL430-W250 at 150`: ID, model and angle, deg):
 
     A way that is too short is shown again
       limits: [1] => limits: [2]        a change of the robot file
@@ -21,11 +21,10 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
 
-import pytest
+from tests.kit.cases import TextCase
 from tests.kit.hands import HandLine, Script, interrupt, written
 
 from dxlrun.compile.robot_compiler import compile_files
@@ -37,15 +36,6 @@ from dxlrun_hand.servo_setup import ServoSetup
 from dxlsim.simulation_plan import ServoConfig
 
 SETTINGS = ("id", "baud_rate", "return_delay_time", "temperature_limit")
-
-
-class Told(NamedTuple):
-    """A case of a text: its robot file, servos, place and lines."""
-
-    robot: str
-    servos: str
-    place: str
-    lines: list[str]
 
 
 class Dialogue:
@@ -155,25 +145,13 @@ CHECKS: dict[str, Callable[..., bool]] = {
 }
 
 
-def dialogues(path: Path) -> Iterator[Any]:
-    """Yield the cases of a text, as parameters of a test."""
-    head, _, body = path.read_text("utf-8").partition("====\n")
-    robot, _, servos = head.partition("----\n")
-    number = head.count("\n") + 2
-    for block in body.split("\n\n"):
-        title, *lines = block.strip().split("\n")
-        told = Told(robot, servos, f"{path.name}:{number}", [line.strip() for line in lines])
-        yield pytest.param(told, id=title)
-        number += block.count("\n") + 2
-
-
-def check_dialogue(folder: Path, told: Told, err: Callable[[], str]) -> None:
+def check_dialogue(folder: Path, told: TextCase, err: Callable[[], str]) -> None:
     """Hold a dialogue, and check what it expects; `err` returns what was written to standard error."""
-    robot, servos, place, lines = told
-    case = Dialogue(folder, robot, servos, [line for line in lines if not line.startswith("#")])
+    robot, _, servos = told.head.partition("----\n")
+    case = Dialogue(folder, robot, servos, [line.text for line in told.lines])
     case.perform()
     written_err = err().replace(str(case.path), "FILE")
-    assert case.said, place
+    assert case.said, told.place
     for line in case.said:
         found = next(
             (match, check) for words, check in CHECKS.items() if (match := re.fullmatch(words, line))
@@ -181,5 +159,5 @@ def check_dialogue(folder: Path, told: Told, err: Callable[[], str]) -> None:
         text = [None if one is None else one.replace("FILE", str(case.path)) for one in found[0].groups()]
         if line.startswith("writes"):
             text = [*found[0].groups()]
-        seen = (place, line, case.code, case.error, case.script.text, written_err)
+        seen = (told.place, line, case.code, case.error, case.script.text, written_err)
         assert found[1](case, written_err, *text), seen

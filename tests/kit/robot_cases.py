@@ -1,8 +1,8 @@
 """Cases of robot files: changes of a robot, what the compiler says of it, and what is in the plan.
 
-Each text in `tests/compile/cases` begins with a robot file. `like pair` stands for the robot file of
-`pair.txt`, to which lines may be added. Other files follow behind `---- NAME`; `motion0.yaml` is played. The
-cases are behind `====`:
+The texts in `tests/compile/cases` have the form of `tests/kit/cases.py`. The head is a robot file; `like
+pair` is the robot file of `pair.txt`, to which lines may be added. Other files follow after `---- NAME`;
+`motion0.yaml` is played:
 
     rate: 25 => rate: §20
       rate 20 Hz of states does not divide the loop's 50 Hz; write the nearest possible rate, 25
@@ -24,15 +24,15 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from enum import Enum
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import pytest
 import yaml
-from tests.kit.robots import CASES, whole_text
+from tests.kit.cases import TextCase
+from tests.kit.robots import whole_text
 
 from dxlrun.compile.robot_compiler import CompiledRobot, compile_files
 from dxlrun.compile.simulation import simulation_of
@@ -56,52 +56,31 @@ UNITS = {"deg": math.radians(1), "mm": 1e-3, "us": 1e3, "ms": 1e6, "s": 1e9, "":
 WORDS: Mapping[str, object] = {"true": True, "false": False, "none": None}
 
 
-class Case(NamedTuple):
-    """Changes of a text, and what is said of it then."""
-
-    place: str
-    text: str
-    changes: list[str]
-    told: list[str]
-    facts: list[str]
-
-    def check(self) -> None:
-        """Compare what is said, and what is in the plan, with what the case has."""
-        text = self.text
-        for change in self.changes:
-            right, _, wrong = change.replace("\\n", "\n").partition(" => ")
-            if right.startswith("+ "):
-                robot, mark, rest = text.partition("---- ")
-                text = f"{robot}{right[2:]}\n{mark}{rest}"
-            else:
-                assert right in text, f"{self.place}: {right}"
-                text = text.replace(right, wrong, 1)
-        before = text.partition("§")[0].rpartition("---- ")
-        file, _, before = before[2].partition("\n") if before[1] else ("robot.yaml", "", before[2])
-        column = len(before) - before.rfind("\n")
-        pointed = f"{file}:{before.count(chr(10)) + 1}:{column}: "
-        compiled, found = compile_cases(text.replace("§", ""))
-        said = [str(one).replace(f"{Path.cwd()}/", "").replace(HELP, "HELP") for one in found]
-        said = [one.removeprefix(pointed).removeprefix("robot.yaml:") for one in said]
-        assert said == self.told, self.place
-        for fact in self.facts:
-            path, _, expected = fact.partition(": ")
-            assert compiled is not None, f"{self.place}: there is no plan"
-            value = value_at(compiled, path)
-            assert is_same(value, yaml.load(expected, yaml.BaseLoader)), f"{self.place}: {path} is {value!r}"  # noqa: S506  texts of ours
-
-
-def cases(name: str) -> Iterator[Case]:
-    """Yield the cases of a text."""
-    head, mark, blocks = (CASES / f"{name}.txt").read_text("utf-8").partition("====\n")
-    for found in re.finditer(r"((?:\S.*\n)*)((?:  .*\n)*)", blocks):
-        if found[0]:
-            line = (head + mark + blocks[: found.start()]).count("\n") + 1
-            changes = [change for change in found[1].splitlines() if not change.startswith("#")]
-            below = [one.strip() for one in found[2].splitlines()]
-            facts = [one.removeprefix("= ") for one in below if one.startswith("= ")]
-            told = [one for one in below if not one.startswith("= ")]
-            yield Case(f"{name}.txt:{line}", whole_text(head), changes, told, facts)
+def check_case(case: TextCase) -> None:
+    """Compare the problems and the plan of a changed robot file with what the case has."""
+    text, place = whole_text(case.head), case.place
+    below = [line.text.strip() for line in case.lines if line.is_indented]
+    for change in filter(None, [case.name, *(line.text for line in case.lines if not line.is_indented)]):
+        right, _, wrong = change.replace("\\n", "\n").partition(" => ")
+        if right.startswith("+ "):
+            robot, mark, rest = text.partition("---- ")
+            text = f"{robot}{right[2:]}\n{mark}{rest}"
+        else:
+            assert right in text, f"{place}: {right}"
+            text = text.replace(right, wrong, 1)
+    before = text.partition("§")[0].rpartition("---- ")
+    file, _, before = before[2].partition("\n") if before[1] else ("robot.yaml", "", before[2])
+    column = len(before) - before.rfind("\n")
+    pointed = f"{file}:{before.count(chr(10)) + 1}:{column}: "
+    compiled, found = compile_cases(text.replace("§", ""))
+    said = [str(one).replace(f"{Path.cwd()}/", "").replace(HELP, "HELP") for one in found]
+    said = [one.removeprefix(pointed).removeprefix("robot.yaml:") for one in said]
+    assert said == [one for one in below if not one.startswith("= ")], place
+    for fact in (one.removeprefix("= ") for one in below if one.startswith("= ")):
+        path, _, expected = fact.partition(": ")
+        assert compiled is not None, f"{place}: there is no plan"
+        value = value_at(compiled, path)
+        assert is_same(value, yaml.load(expected, yaml.BaseLoader)), f"{place}: {path} is {value!r}"  # noqa: S506  texts of ours
 
 
 def compile_cases(text: str) -> tuple[CompiledRobot | None, tuple[Problem, ...]]:

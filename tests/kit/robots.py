@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from textwrap import dedent
 
+from tests.kit.cases import read_head
+
 from dxlrun.compile.robot_compiler import CompiledRobot, compile_files
 from dxlrun.errors import InputError, Problem
 
@@ -14,7 +16,7 @@ CASES = Path(__file__).parents[1] / "compile" / "cases"
 
 def robot_text(name: str) -> str:
     """Return the robot file of a text of cases."""
-    return whole_text((CASES / f"{name}.txt").read_text("utf-8").partition("====\n")[0]).partition("---- ")[0]
+    return whole_text(read_head(CASES / f"{name}.txt")).partition("---- ")[0]
 
 
 def whole_text(head: str) -> str:

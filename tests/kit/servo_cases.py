@@ -1,7 +1,6 @@
 """Cases of servos as text: what is different about them, what happens, and what the runtime does about it.
 
-A file in `tests/dynamixel/cases` has cases that are separated by blank lines. A case has a title, indented
-steps, and lines that begin with `=>`:
+The texts in `tests/dynamixel/cases` have the form of `tests/kit/cases.py`:
 
     a servo that lost its power returns without torque
       servos: XM430-W350 11 12, watchdog 10
@@ -9,8 +8,8 @@ steps, and lines that begin with `=>`:
       3 cycles
       servo 12: power cut for 0.3 s
       100 cycles
-    => servo rebooted arm_12_joint: ...
-    => torque: 11
+      => servo rebooted arm_12_joint: ...
+      => torque: 11
 
 The tables at the end of this file have all steps. The robot starts before the first `=>`, at the step
 `start`, or before the first step that needs a robot that has started. Each event that is not routine, each
@@ -26,13 +25,14 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from msgspec.structs import replace
+from tests.kit.cases import TextCase
 from tests.kit.line_faults import corrupt_next, delay_next, truncate_next, turn_by_hand
 from tests.kit.plans import make_plan
 from tests.kit.rigs import Rig, every_servo, make_rig, make_x
@@ -52,11 +52,9 @@ ROUTINE = ("setup ", "torque on ", "torque off ", "read lost ", "read back ", "a
 
 @dataclass
 class Case:
-    """One case: its file, title and numbered lines, and what came of it."""
+    """A case of a text, and what came of it."""
 
-    place: str
-    title: str
-    lines: list[tuple[int, str]]
+    text: TextCase
     plan: BusPlan = field(default_factory=make_plan)
     options: dict[str, Any] = field(default_factory=dict)
     _rig: Rig | None = None
@@ -68,20 +66,22 @@ class Case:
 
     def check(self) -> None:
         """Run the case to its end; an error names the file and the line."""
-        for number, line in self.lines:
+        for line in self.text.lines:
             try:
-                self.follow(line)
+                self.follow(line.text)
             except Exception as error:
                 rest = "".join(f"\n=> {one}" for one in self.reports())
-                raise AssertionError(f"{self.place}:{number}: {line.strip()}: {error}{rest}") from error
+                raise AssertionError(f"{line.place}: {line.text}: {error}{rest}") from error
         self.begin()
         more = [report for report in self.reports() if not report.startswith(ROUTINE)]
-        assert not more, "\n".join([f"{self.place}:{self.lines[-1][0]}: more was reported:", *more])
-        if self.refused and not any("torque" in line and " off " in line for _, line in self.lines):
-            assert not self.rig.writes() or self.has("=> writes"), f"{self.title}: a refused start wrote"
+        assert not more, "\n".join([f"{self.text.lines[-1].place}: more was reported:", *more])
+        if self.refused and not any(
+            "torque" in line.text and " off " in line.text for line in self.text.lines
+        ):
+            assert not self.rig.writes() or self.has("=> writes"), f"{self.text.place}: a refused start wrote"
 
     def has(self, beginning: str) -> bool:
-        return any(line.startswith(beginning) for _, line in self.lines)
+        return any(line.text.startswith(beginning) for line in self.text.lines)
 
     @property
     def rig(self) -> Rig:
@@ -99,7 +99,7 @@ class Case:
     def follow(self, line: str) -> None:
         """Do a step, or check an expectation."""
         if not line.startswith("=>"):
-            do_one(STEPS, line.strip(), self)
+            do_one(STEPS, line, self)
             return
         self.begin()
         if not do_one(EXPECTATIONS, line[2:].strip(), self, optional=True):
@@ -344,17 +344,3 @@ EXPECTATIONS: dict[str, Callable[..., object]] = {
     ),
     r"mode (\d+): (\w+)": Case.expect_mode,
 }
-
-
-def read_cases(path: Path, kind: type[Case] = Case) -> Iterator[Case]:
-    """Yield the cases of a file."""
-    block: list[tuple[int, str]] = []
-    for number, line in enumerate([*path.read_text("utf-8").splitlines(), ""], 1):
-        if line.startswith("#"):
-            continue
-        if line:
-            block.append((number, line))
-        elif block:
-            (_, title), *lines = block
-            yield kind(path.name, title, lines)
-            block = []

@@ -1,15 +1,15 @@
 """Steered robots as text: what clients request at which time, and what must come of it.
 
-Each text in `tests/steering` has a robot file and, behind `====`, stories. A story is a title, changes of the
-robot (`active: false => active: true`), and steps on virtual time:
+The texts in `tests/steering` have the form of `tests/kit/cases.py`; the head is a robot file. A story has
+changes of the robot (`active: false => active: true`), and steps on virtual time:
 
     A joint that is commanded is not released by mistake
-    at 0.4 s  torque off elbow
-      => refused joint_commanded: elbow is commanded by arm
-      => elbow holds
-    at 0.6 s  torque off elbow release
-      => elbow limp
-      => active none
+      at 0.4 s  torque off elbow
+        => refused joint_commanded: elbow is commanded by arm
+        => elbow holds
+      at 0.6 s  torque off elbow release
+        => elbow limp
+        => active none
 
 A line `=>` holds at the end of its step, which is the beginning of the next one; the last step has 0.2 s.
 Requests of a step are separated by `;`, and are done where nothing else is said of them. `ACTIONS` and
@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache, partial
@@ -31,6 +31,7 @@ import msgspec
 import numpy as np
 import pytest
 import yaml
+from tests.kit.cases import Line, TextCase
 from tests.kit.line_faults import turn_by_hand
 
 import dxlrun
@@ -48,7 +49,6 @@ from dxlrun.testing import VirtualRobot, plan_of
 from dxlsim.servo.simulated_servo import SimulatedServo
 from dxlwire.modes import Mode
 
-STORIES = Path(__file__).parents[1] / "steering"
 LAST_S = 0.2
 
 
@@ -127,27 +127,25 @@ class Scripted(dxlrun.Controller[ScriptedParameters]):
 
 @dataclass
 class Step:
-    """Actions at a time, and the lines of what holds at the end; `line` is that of the file."""
+    """Actions at a time, and the lines of what holds at the end."""
 
     at_s: float
     actions: list[str]
-    line: int
-    checks: list[tuple[int, str]] = field(default_factory=list)
+    place: str
+    checks: list[Line] = field(default_factory=list)
 
 
 @dataclass
 class Story(QueueInbox):
     """A case of a text: runs its robot, and checks each step."""
 
-    file: str
-    title: str
     robot_text: str
     steps: list[Step]
 
     def check(self, folder: Path) -> None:
         """Run the story; raise AssertionError with file, line and what was found."""
         QueueInbox.__init__(self)
-        self.coming, self.step = list(self.steps), Step(-1.0, [], 0)
+        self.coming, self.step = list(self.steps), Step(-1.0, [], "")
         self.events: list[str] = []
         self.calls: list[str] = []
         self.sets: list[list[str]] = []
@@ -174,7 +172,7 @@ class Story(QueueInbox):
             servo.registers.watch_items(("torque_enable",), partial(self.see_torque, name, servo))
         self.result = self.robot.run()
         self.end_step()
-        assert not self.coming, f"{self.file}:{self.coming[0].line}: the run ended before: {self.result}"
+        assert not self.coming, f"{self.coming[0].place}: the run ended before: {self.result}"
 
     # While it runs
 
@@ -234,7 +232,7 @@ class Story(QueueInbox):
             if found := re.fullmatch(pattern, text):
                 act(self, *found.groups())
                 return
-        raise AssertionError(f"{self.file}:{self.step.line}: no action: {text}")
+        raise AssertionError(f"{self.step.place}: no action: {text}")
 
     def ask(self, kind: str, /, of: str = LOOP, lease_ns: int = 0, **data: Any) -> None:
         """Put a request for the loop into the inbox, or the command of a controller."""
@@ -281,17 +279,18 @@ class Story(QueueInbox):
         """Check the lines of the step that ends."""
         answers = [self.answers.get(number) for number in self.asked]
         self.unnamed = list(zip(self.asked, answers, strict=True))
-        for line, text in self.step.checks:
+        for place, line, _ in self.step.checks:
+            text = line.removeprefix("=> ")
             for pattern, check in CHECKS.items():
                 if found := re.fullmatch(pattern, text):
                     what = check(self, *found.groups())
-                    assert what is None, f"{self.file}:{line}: {text}\n  found: {what}\n  {self.told}"
+                    assert what is None, f"{place}: {text}\n  found: {what}\n  {self.told}"
                     break
             else:
-                raise AssertionError(f"{self.file}:{line}: no check: {text}")
+                raise AssertionError(f"{place}: no check: {text}")
         for _, answer in self.unnamed:
             done = isinstance(answer, Completion)
-            assert done, f"{self.file}:{self.step.line}: not done: {answer}\n  {self.told}"
+            assert done, f"{self.step.place}: not done: {answer}\n  {self.told}"
 
     @property
     def told(self) -> str:
@@ -477,33 +476,22 @@ def compile_story(text: str, folder: Path) -> Plan:
     return PLANS[text]
 
 
-def stories(path: Path) -> Iterator[Story]:
-    """Yield the stories of a text."""
-    whole = path.read_text("utf-8")
-    robot = whole.partition("====\n")[0]
-    story: Story | None = None
-    first = robot.count("\n") + 1
-    for number, line in enumerate(whole.splitlines()[first:], first + 1):
-        if not line.strip():
-            if story is not None:
-                yield story
-            story = None
-        elif line.startswith("#"):
-            continue
-        elif story is None:
-            story = Story(path.name, line.strip(), robot, [])
-        elif found := re.fullmatch(r"at (\S+) s *(.*)", line):
+def read_story(case: TextCase) -> Story:
+    """Return the story of a case."""
+    story = Story(case.head, [])
+    for line in case.lines:
+        if found := re.fullmatch(r"at (\S+) s *(.*)", line.text):
             actions = found[2].split("; ") if found[2] else []
-            story.steps.append(Step(float(found[1]), actions, number))
-        elif line.strip().startswith("=> "):
-            story.steps[-1].checks.append((number, line.strip()[3:]))
+            story.steps.append(Step(float(found[1]), actions, line.place))
+        elif line.text.startswith("=> "):
+            assert story.steps, f"{line.place}: nothing is expected before the first step"
+            story.steps[-1].checks.append(line)
         else:
-            right, _, wrong = line.replace("\\n", "\n").partition(" => ")
-            assert right in story.robot_text or right.startswith("+ "), f"{path.name}:{number}: {right}"
+            right, _, wrong = line.text.replace("\\n", "\n").partition(" => ")
+            assert right in story.robot_text or right.startswith("+ "), f"{line.place}: {right}"
             story.robot_text = (
                 f"{story.robot_text}{right[2:]}\n"
                 if right.startswith("+ ")
                 else story.robot_text.replace(right, wrong, 1)
             )
-    if story is not None:
-        yield story
+    return story

@@ -1,7 +1,7 @@
 """Robots on virtual time by stories in text: what a client asks, what fails, and how goals and shafts end.
 
-A text is a robot file, or a line with the name of one in `robots`; after `----` a motion for it,
-and after `====` cases. A case is a sentence and lines:
+The texts have the form of `tests/kit/cases.py`. The head is a robot file, or a line with the name of one in
+`robots`, and after `----` a motion for it:
 
     A jammed joint misses its goal
       run 3 s leader_torque:=off       duration, and arguments of the robot file
@@ -27,7 +27,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -35,6 +35,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from tests.kit.cases import Line, TextCase, read_cases
 from tests.kit.clients import Ask, Client
 from tests.kit.line_faults import turn_by_hand
 
@@ -201,55 +202,49 @@ def matches(found: str, text: str) -> bool:
     return re.fullmatch(pattern, found, re.DOTALL) is not None
 
 
-def stories(folder: Path) -> Iterator[Any]:
-    """Yield the cases of all texts in a folder, as parameters of a test: path, head, and numbered lines."""
-    for path in sorted(folder.glob("*.txt")):
-        head, _, body = path.read_text("utf-8").partition("====\n")
-        start = head.count("\n") + 2
-        for block in body.split("\n\n"):
-            lines = [(start + n, line.strip()) for n, line in enumerate(block.split("\n"))]
-            start += block.count("\n") + 2
-            (_, title), *told = [(n, line) for n, line in lines if line and line[0] != "#"]
-            for name, each in variants(told):
-                needed = [line.partition(" ")[2] for _, line in each if line.startswith("needs ")]
-                rest = [(number, line) for number, line in each if not line.startswith("needs ")]
-                marks = [pytest.mark.needs(one) for one in needed]
-                yield pytest.param(path, head, rest, id=f"{path.stem}: {title}{name}", marks=marks)
+def story_parameters(folder: Path) -> Iterator[Any]:
+    """Yield the cases of all texts in a folder, as parameters of a test."""
+    for case in read_cases(folder):
+        for name, each in variants(case.lines):
+            marks = [pytest.mark.needs(line.text[6:]) for line in each if line.text.startswith("needs ")]
+            rest = [line for line in each if not line.text.startswith("needs ")]
+            yield pytest.param(case._replace(lines=rest), id=f"{case.place}: {case.name}{name}", marks=marks)
 
 
-def variants(told: list[tuple[int, str]]) -> Iterator[tuple[str, list[tuple[int, str]]]]:
+def variants(told: Sequence[Line]) -> Iterator[tuple[str, Sequence[Line]]]:
     """Yield the lines of a case for each text that a name stands for."""
-    named = [re.match(r"([A-Z]+) = (.*)", line) for _, line in told]
+    named = [re.match(r"([A-Z]+) = (.*)", line.text) for line in told]
     name, texts = next((one.groups() for one in named if one), ("", ""))
     if not name:
         yield "", told
         return
     rest = [one for one, match in zip(told, named, strict=True) if not match]
     for text in map(str.strip, texts.split(" | ")):
-        yield f" ({text})", [(number, line.replace(name, text)) for number, line in rest]
+        yield f" ({text})", [line._replace(text=line.text.replace(name, text)) for line in rest]
 
 
-def check_story(path: Path, head: str, lines: list[tuple[int, str]], folder: Path) -> None:
+def check_story(case: TextCase, folder: Path) -> None:
     """Perform a story in an empty folder, and check what it expects; errors name file and line."""
-    robot, _, motion = head.partition("----\n")
+    robot, _, motion = case.head.partition("----\n")
     if robot.strip().endswith(".yaml"):
         robot = (ROBOTS / robot.strip()).read_text("utf-8")
-    if any("mujoco" in line for _, line in lines):
+    texts = [line.text for line in case.lines]
+    if any("mujoco" in text for text in texts):
         pytest.importorskip("mujoco")
-    shafts = {int(line.split()[2].rstrip(":")) for _, line in lines if line.startswith("=> shaft ")}
-    story = Story(folder, path, robot, motion, shafts)
+    shafts = {int(text.split()[2].rstrip(":")) for text in texts if text.startswith("=> shaft ")}
+    story = Story(folder, case.file, robot, motion, shafts)
     performed = False
-    for number, line in lines:
+    for place, text, _ in case.lines:
         try:
-            if not line.startswith("=> "):
-                story.tell(line)
+            if not text.startswith("=> "):
+                story.tell(text)
                 continue
             if not performed:
                 story.perform()
             performed = True
-            story.expect(line.removeprefix("=> "))
+            story.expect(text.removeprefix("=> "))
         except Exception as error:
-            error.add_note(f"{path}:{number}: {line}")
+            error.add_note(f"{place}: {text}")
             raise
     assert performed, "the story expects nothing"
     story.finish()

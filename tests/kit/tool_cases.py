@@ -74,7 +74,7 @@ class ToolCase(Case):
 
     def follow(self, line: str) -> None:
         if not line.startswith("=>"):
-            do_one(STEPS, line.strip(), self)
+            do_one(STEPS, line, self)
         elif not do_one(EXPECTATIONS, line[2:].strip(), self, optional=True):
             self.expect_report(line[2:].strip())
 

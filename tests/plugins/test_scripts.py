@@ -1,6 +1,6 @@
 """Controllers by scripts: what they command and report when servos, clients and time do what a text says.
 
-A text in `scripts` is a controller, and after `====` cases. A case is a sentence, and lines of what happens:
+The texts in `scripts` have the form of `tests/kit/cases.py`; the head is a controller:
 
     A command between two updates starts from the position that is desired then
       at 0 trajectory to 1.3 in 1 s
@@ -24,7 +24,6 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any
@@ -33,13 +32,13 @@ import numpy as np
 import pytest
 import yaml
 from msgspec.structs import replace
+from tests.kit.cases import TextCase, case_parameters
 from tests.kit.stages import Stage
 
 from dxlrun import LINEAR, MotorLoad, MotorModel, ServoModel
 from dxlrun.channels.cycle import Torque
 from dxlrun_controllers.plugin import dxlrun_controllers
 
-SCRIPTS = Path(__file__).with_name("scripts")
 LINE = re.compile(
     r"(?:at (?P<times>[\d. ]+?)(?:\s|$))?(?:steps (?P<steps>\d+)|(?P<word>[a-z]\w*) ?(?P<rest>.*))?$"
 )
@@ -235,28 +234,15 @@ class Scene:
         assert not any(self.unexpected.values()), self.unexpected
 
 
-def scripts() -> Iterator[Any]:
-    for path in sorted(SCRIPTS.glob("*.txt")):
-        head, _, body = path.read_text("utf-8").partition("====\n")
-        start = head.count("\n") + 2
-        for block in body.split("\n\n"):
-            lines = [(start + n, line) for n, line in enumerate(block.split("\n"))]
-            lines = [(number, line) for number, line in lines if line.strip() and line.strip()[0] != "#"]
-            start += block.count("\n") + 2
-            if lines:
-                title = lines[0][1]
-                yield pytest.param(path, head, lines[1:], id=f"{path.stem}: {title}")
-
-
-@pytest.mark.parametrize(("path", "head", "lines"), list(scripts()))
-def test_script(path: Path, head: str, lines: list[tuple[int, str]]) -> None:
-    first = parsed(head)
+@pytest.mark.parametrize("case", case_parameters(Path(__file__).with_name("scripts")))
+def test_script(case: TextCase) -> None:
+    first = parsed(case.head)
     scene = Scene(first["keys"], first.get("with", {}), first.get("before", {}))
-    for number, line in lines:
+    for place, line, _ in case.lines:
         try:
-            scene.perform(line.strip())
+            scene.perform(line)
         except Exception as error:
-            error.add_note(f"{path}:{number}: {line.strip()}")
+            error.add_note(f"{place}: {line}")
             raise
     scene.finish()
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from tests.kit.told_stories import check_story, stories
+from tests.kit.cases import TextCase
+from tests.kit.told_stories import check_story, story_parameters
 
 pytestmark = pytest.mark.long
 
 
-@pytest.mark.parametrize(("path", "head", "lines"), [*stories(Path(__file__).with_name("stories"))])
-def test_story(path: Path, head: str, lines: list[tuple[int, str]], tmp_path: Path) -> None:
-    check_story(path, head, lines, tmp_path)
+@pytest.mark.parametrize("case", [*story_parameters(Path(__file__).with_name("stories"))])
+def test_story(case: TextCase, tmp_path: Path) -> None:
+    check_story(case, tmp_path)

@@ -5,15 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from tests.kit.steering import STORIES, Story, stories
-
-FOUND = [
-    pytest.param(story, id=f"{path.stem}: {story.title}")
-    for path in sorted(STORIES.glob("*.txt"))
-    for story in stories(path)
-]
+from tests.kit.cases import TextCase, case_parameters
+from tests.kit.steering import read_story
 
 
-@pytest.mark.parametrize("story", FOUND)
-def test_each_story_comes_out_as_written(story: Story, tmp_path: Path) -> None:
-    story.check(tmp_path)
+@pytest.mark.parametrize("case", case_parameters(Path(__file__).parent))
+def test_each_story_comes_out_as_written(case: TextCase, tmp_path: Path) -> None:
+    read_story(case).check(tmp_path)
