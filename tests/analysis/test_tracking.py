@@ -210,7 +210,7 @@ def test_states_that_are_not_valid_are_no_error_and_a_joint_that_stands_has_no_l
     log = make(np.zeros(100), positions)
     log.cycles["position"][50, 0] = 3.0  # any value may stand there
     joint = only(log)
-    assert (joint.invalid, joint.lag_ms) == (1, None)
+    assert (joint.invalid, joint.lag_ms, joint.settling_ms) == (1, None, None)
     assert joint.worst_rad == pytest.approx(0.099)
 
 
