@@ -46,17 +46,13 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_its_delays_add_up(log: Path) -> None:
+def test_its_delays_add_up_and_its_replay_has_no_difference(log: Path) -> None:
     cycles = read_log(log).cycles
     delays = cycles["woken_ns"] - cycles["scheduled_ns"]
     assert cycles["cycle"].tolist() == list(range(320))
     assert delays.max() > 2 * PERIOD_NS
     assert int(cycles["woken_ns"][-1]) == int(cycles["scheduled_ns"][0]) + 319 * PERIOD_NS + int(delays.sum())
-
-
-def test_its_replay_has_no_difference(log: Path) -> None:
-    report = replay_log(log)
-    assert report.sentence == "single_joint: 320 cycles replayed, 0 differences"
+    assert replay_log(log).sentence == "single_joint: 320 cycles replayed, 0 differences"
 
 
 def test_its_analysis_finds_one_rate_and_every_period(log: Path) -> None:
@@ -69,28 +65,22 @@ def test_its_analysis_finds_one_rate_and_every_period(log: Path) -> None:
     sentence = "The loop ran sequentially, not by the clock: 320 periods of 320 Hz took 1."
     assert any(one.startswith(sentence) for one in report.verdict.sentences)
     assert judge_run(totals_of(log)).sentences[1] == report.verdict.sentences[1]
-    assert report.totals.periods.rates_hz == (320.0,)
-    assert (report.totals.periods.elapsed, report.totals.periods.skipped, report.totals.periods.agree) == (
-        320,
-        0,
-        True,
-    )
-    assert report.totals.periods.seconds > 1.1
+    periods = report.totals.periods
+    assert periods.rates_hz == (320.0,)
+    assert (periods.elapsed, periods.skipped, periods.agree) == (320, 0, True)
+    assert periods.seconds > 1.1
     assert report.totals.latency is not None
     assert report.totals.latency.max_us > 6_000
 
 
-def test_times_that_no_sequence_has_are_refused(log: Path) -> None:
+def test_times_that_a_schedule_cannot_have_are_refused(log: Path) -> None:
     read = read_log(log)
     cycles = read.cycles.copy()
     cycles["scheduled_ns"][100] -= 1
     with pytest.raises(LogError, match="the times of cycle 100 contradict its number"):
         recorded_inputs.recorded(replace(read, cycles=cycles))
 
-
-def test_an_absolute_schedule_would_not_have_such_times(log: Path) -> None:
-    read = read_log(log)
-    data = read.attachments["plan.json"].replace(b'"schedule":"sequential"', b'"schedule":"absolute"')
+    absolute = read.attachments["plan.json"].replace(b'"schedule":"sequential"', b'"schedule":"absolute"')
     with pytest.raises(LogError, match="contradict its number"):
-        recorded_inputs.recorded(replace(read, attachments={**read.attachments, "plan.json": data}))
+        recorded_inputs.recorded(replace(read, attachments={**read.attachments, "plan.json": absolute}))
     assert np.diff(read.cycles["scheduled_ns"]).max() > PERIOD_NS
