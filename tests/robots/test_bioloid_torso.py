@@ -48,7 +48,7 @@ def test_the_joints_are_those_of_the_table_cut_to_their_reach(torso):
         assert joint.upper == pytest.approx(min(ends[1], urdf[1]))
 
 
-def test_loop_bus_and_controllers(torso):
+def test_loop_bus_controllers_and_the_odd_twin(torso):
     loop, (bus,) = torso.plan.loop, torso.plan.buses
     scheduler = loop.scheduler
     assert loop.period_ns == 20_000_000
@@ -64,9 +64,6 @@ def test_loop_bus_and_controllers(torso):
     assert {c.name for c in loop.controllers if not c.active} == whole
     (broadcaster,) = [c for c in loop.controllers if c.publishes]
     assert (broadcaster.active, broadcaster.every) == (True, 1)
-
-
-def test_the_only_warning_is_the_odd_twin(torso):
     (warning,) = torso.warnings
     twins = "right_shoulder_lateral_joint is not a mirror image of left_shoulder_lateral_joint"
     assert warning.what.startswith(twins)

@@ -92,34 +92,16 @@ def turned(tmp_path: Path) -> Callable[..., Log]:
     return run
 
 
-def matrices(q: Array) -> Array:
-    """Return the rotations of quaternions x, y, z, w, shape (cycles, 3, 3)."""
-    x, y, z, w = q.T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.moveaxis(np.array(rows), -1, 0)
-
-
-def about(axis: int, angle: Array) -> Array:
-    q = np.zeros((len(angle), 4))
-    q[:, axis], q[:, 3] = np.sin(angle / 2), np.cos(angle / 2)
-    return matrices(q)
-
-
 def errors(log: Log) -> tuple[Array, Array]:
     """Return by how much each cycle's orientation is off in all, and its vertical alone, deg."""
+    from scipy.spatial.transform import Rotation
+
     names = [f"{source}/{one}" for source, states in log.header.sources.items() for one in states]
     first = names.index("imu/orientation.x")
-    found = matrices(log.cycles["source_state"][:, first : first + 4])
-    yaw, pitch, roll = log.cycles["position"].T
-    true = about(2, yaw) @ about(1, pitch) @ about(0, roll)
-    off = np.einsum("nji,njk->nik", true, found)
-    whole = np.degrees(np.arccos(np.clip((np.trace(off, axis1=1, axis2=2) - 1) / 2, -1, 1)))
-    up = np.degrees(np.arccos(np.clip(np.einsum("ni,ni->n", true[:, 2], found[:, 2]), -1, 1)))
-    return whole, up
+    found = Rotation.from_quat(log.cycles["source_state"][:, first : first + 4])
+    true = Rotation.from_euler("ZYX", log.cycles["position"])
+    up = np.einsum("ni,ni->n", true.as_matrix()[:, 2], found.as_matrix()[:, 2])
+    return np.degrees((true.inv() * found).magnitude()), np.degrees(np.arccos(np.clip(up, -1, 1)))
 
 
 @pytest.mark.parametrize(
