@@ -208,7 +208,7 @@ def test_a_run_of_its_own_frees_the_joint_and_ends_in_order_by_a_signal(robot):
     ran = run_on_robot(plays, ["pair.yaml", "pan"])
     assert (ran.robot, ran.exit_code, ran.why, len(plays.got)) == ("pair", 130, "aborted by SIGHUP", 1)
     assert ran.problems == ()
-    assert set(sockets()) == others
+    assert set(sockets()) <= others  # the other run may have died: its verdict is that of a machine in use
     assert whole(ran.log), "it ended in order, at its rate"
     assert signal.signal(signal.SIGHUP, outer) is signal.SIG_DFL
 
