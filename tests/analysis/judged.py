@@ -19,12 +19,12 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from msgspec import structs
+from tests.kit.cases import TextCase
 
 from dxlrun import LINEAR, ROTARY
 from dxlrun.channels.event_records import RUN_ENDED, EventCode, EventGroup, GoalReport, GoalTotals, Severity
@@ -183,27 +183,23 @@ GIVEN: dict[str, Given] = {
 }
 
 
-class Case(NamedTuple):
-    """Lines about a run, and what is expected of the verdict on it, each with its place."""
-
-    name: str
-    given: list[tuple[str, str]]
-    expected: list[tuple[str, str]]
-
-    def check(self) -> None:
-        run = totals()
-        for place, text in self.given:
+def check_case(case: TextCase) -> None:
+    """Judge the run of a case, and compare the verdict with what is expected."""
+    run = totals()
+    expected = [(line.place, line.text[3:]) for line in case.lines if line.text.startswith("=> ")]
+    assert expected, f"{case.place}: nothing is expected"
+    for line in case.lines:
+        for text in [] if line.text.startswith("=> ") else line.text.split("; "):
             found = [(re.fullmatch(pattern, text), given) for pattern, given in GIVEN.items()]
             (one, given), *_ = [pair for pair in found if pair[0]] or [(None, None)]
-            assert given, f"{place}: {text!r} is no line of a run"
+            assert given, f"{line.place}: {text!r} is no line of a run"
             run = given(run, *one.groups())
-        verdict = judge_run(run)
-        shown = "\n".join(
-            f"{one.code} {one.subject} {one.rank!r}: {one.sentence} -> {one.remedy}"
-            for one in verdict.findings
-        )
-        for place, text in self.expected:
-            assert holds(verdict, text), f"{place}: {text}\n{verdict.word}\n{shown}"
+    verdict = judge_run(run)
+    shown = "\n".join(
+        f"{one.code} {one.subject} {one.rank!r}: {one.sentence} -> {one.remedy}" for one in verdict.findings
+    )
+    for place, text in expected:
+        assert holds(verdict, text), f"{place}: {text}\n{verdict.word}\n{shown}"
 
 
 def holds(verdict: Any, text: str) -> bool:
@@ -231,19 +227,3 @@ def holds(verdict: Any, text: str) -> bool:
         "no fix": lambda: own and not any(one.remedy and rest in one.remedy for one in own),
     }
     return bool(checks[kind]())
-
-
-def read_cases(file: Path) -> Iterator[Case]:
-    """Yield the cases of a text."""
-    case = Case("", [], [])
-    for number, line in enumerate(file.read_text("utf-8").splitlines(), 1):
-        place, text = f"{file.name}:{number}", line.lstrip()
-        if line.startswith("  => "):
-            case.expected.append((place, text.removeprefix("=> ")))
-        elif line.startswith("  "):
-            case.given.extend((place, one) for one in text.split("; "))
-        elif text and not text.startswith("#"):
-            if case.name:
-                yield case
-            case = Case(text, [], [])
-    yield case

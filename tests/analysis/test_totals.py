@@ -5,15 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from tests.analysis.judged import Case, read_cases
+from tests.analysis.judged import check_case
+from tests.kit.cases import TextCase, case_parameters, read_cases
 
-CASES = list(read_cases(Path(__file__).with_name("totals.txt")))
 
-
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
-def test_verdict_on_totals(case: Case) -> None:
-    assert case.expected, case.name
-    case.check()
+@pytest.mark.parametrize("case", case_parameters(Path(__file__).with_name("totals.txt")))
+def test_verdict_on_totals(case: TextCase) -> None:
+    check_case(case)
 
 
 @pytest.mark.parametrize(
@@ -32,4 +30,4 @@ def test_what_does_not_hold_is_named_with_its_line(text: str, told: str, tmp_pat
     (tmp_path / "a.txt").write_text(text)
     (case,) = read_cases(tmp_path / "a.txt")
     with pytest.raises(AssertionError, match=told):
-        case.check()
+        check_case(case)

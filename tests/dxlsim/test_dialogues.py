@@ -27,6 +27,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
+from tests.kit.cases import read_cases
 from tests.kit.line_faults import turn_by_hand
 from tests.kit.simulated_line import Answer, Line, split_statuses
 
@@ -45,6 +46,7 @@ ERRORS = {
 }  # fmt: skip
 """e-Manual, Protocol 1.0 and 2.0, section "Error"."""
 SETTINGS = {"delay_us": ("return_delay_ns", 1000), "write_ms": ("write_time_ns", 1_000_000)}
+COMMENT = re.compile(r"\s+#( .*|$)")
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
 
 
@@ -229,27 +231,24 @@ class Case(NamedTuple):
                 raise AssertionError(f"{place}: {step}: {error}") from error
 
 
-def cases(path: Path) -> Iterator[Any]:
-    """Yield the cases of a text: with each of their models."""
-    steps: list[tuple[str, str]] = []
-    for number, line in enumerate(path.read_text("utf-8").splitlines(), 1):
-        text = re.sub(r"(^|\s+)#( .*|$)", "", line)
-        place = f"{path.name}:{number}"
-        if text.startswith("  "):
-            steps += [(place, step) for step in text.strip().split("; ")]
-        elif text:
-            title = re.fullmatch(r"(.+) \[(.+)\]", text)
-            assert title, f"{place}: a title ends with its servos, such as [AX-12A 1 2]"
-            words, steps = title[2].split(), []
-            models = [word for word in words if re.search("[A-Z]", word) and "=" not in word]
-            for model in models:
-                case = Case(model, [word for word in words if word not in (*models, "|")], steps)
-                yield pytest.param(case, id=f"{place}: {title[1]}" + (f" [{model}]" if models[1:] else ""))
+def cases() -> Iterator[Any]:
+    """Yield the cases of all texts: with each of their models."""
+    for text in read_cases(Path(__file__).with_name("dialogues")):
+        title = re.fullmatch(r"(.+) \[(.+)\]", COMMENT.sub("", text.name))
+        assert title, f"{text.place}: a title ends with its servos, such as [AX-12A 1 2]"
+        words = title[2].split()
+        models = [word for word in words if re.search("[A-Z]", word) and "=" not in word]
+        words = [word for word in words if word not in (*models, "|")]
+        steps = [
+            (line.place, step)
+            for line in text.lines
+            for step in COMMENT.sub("", line.text).strip().split("; ")
+        ]
+        for model in models:
+            name = f"{text.place}: {title[1]}" + (f" [{model}]" if models[1:] else "")
+            yield pytest.param(Case(model, words, steps), id=name)
 
 
-TEXTS = sorted((Path(__file__).parent / "dialogues").glob("*.txt"))
-
-
-@pytest.mark.parametrize("case", [case for path in TEXTS for case in cases(path)])
+@pytest.mark.parametrize("case", [*cases()])
 def test_dialogue(case: Case) -> None:
     case.run()

@@ -6,6 +6,7 @@ import random
 from pathlib import Path
 
 import pytest
+from tests.kit.cases import read_lines
 from tests.kit.simulated_line import Line
 
 from dxlsim.faults.fault import fault_help, parse_fault
@@ -14,8 +15,7 @@ from dxlsim.faults.values import READERS
 from dxlwire.exceptions import InputError
 
 MS = 1_000_000
-TEXT = Path(__file__).with_name("fault_lines.txt").read_text("utf-8")
-LINES = [line for line in TEXT.splitlines() if line and not line.startswith("#")]
+LINES = [line.text for line in read_lines(Path(__file__).with_name("fault_lines.txt")) if line.text]
 RIGHT = [line for line in LINES if " = " not in line and "=> " not in line]
 VALUES: dict[str, str] = {
     "bus": "main",

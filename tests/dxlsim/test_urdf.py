@@ -6,13 +6,13 @@ import math
 from pathlib import Path
 
 import pytest
+from tests.kit.cases import TextCase, case_parameters, read_head
 
 from dxlsim.geometry.urdf import Mimic, UrdfLimits, leader, read_urdf
 from dxlwire.exceptions import InputError
 
-TEXT = Path(__file__).with_name("urdf_mistakes.txt").read_text("utf-8")
-ARM, *_ = TEXT.partition("\n")[2].split("====\n")
-CASES = TEXT.split("====\n")[1].strip().split("\n\n")
+TEXT = Path(__file__).with_name("urdf_mistakes.txt")
+ARM = read_head(TEXT)
 
 
 def test_everything_is_read() -> None:
@@ -41,10 +41,10 @@ def test_each_joint_stands_behind_the_one_above_it() -> None:
     assert urdf.links == tuple(f"l{number}" for number in range(2999, -1, -1))
 
 
-@pytest.mark.parametrize("case", CASES)
-def test_a_mistake_is_named_at_its_place(case: str) -> None:
-    change, told = case.split("\n  ")
-    right, _, wrong = change.partition(" => ")
+@pytest.mark.parametrize("case", case_parameters(TEXT))
+def test_a_mistake_is_named_at_its_place(case: TextCase) -> None:
+    right, _, wrong = case.name.partition(" => ")
+    ((_, told, _),) = case.lines
     assert right in ARM
     with pytest.raises(InputError) as caught:
         read_urdf(ARM.replace(right, wrong), "arm.urdf")

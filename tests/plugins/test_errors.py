@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 from tests.kit.answers import read_answer
+from tests.kit.cases import read_cases
 
 from dxlrun.cli import main
 
@@ -21,10 +22,9 @@ PLAIN = Path(__file__).with_name("plain")
 NOT_OFFERED = "no plug-in offers the controller type easing_position_controller of head; "
 CONTROLLER = (PLAIN / "controller.py").read_text()
 PLUGIN = (EXAMPLE / "src/dxlrun_easing/plugin.py").read_text()
-LINES = (PLAIN / "mistakes.txt").read_text("utf-8").splitlines()
 MISTAKES = [
-    (*change.split(" => "), sentence.strip())
-    for change, sentence in zip(LINES[::2], LINES[1::2], strict=True)
+    (*case.name.split(" => "), *(line.text for line in case.lines))
+    for case in read_cases(PLAIN / "mistakes.txt")
 ]
 
 Printed = Callable[..., list[str]]

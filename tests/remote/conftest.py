@@ -13,6 +13,7 @@ from typing import ClassVar
 import msgspec
 import numpy as np
 import pytest
+from tests.kit.cases import read_head
 
 import dxlrun
 from dxlrun.channels import heartbeat, mailbox, ring
@@ -135,7 +136,7 @@ def plan_in(tmp_path_factory):
     @cache
     def compiled(name):
         file = tmp_path_factory.mktemp("requests") / "robot.yaml"
-        file.write_text((TEXTS / name).read_text("utf-8").partition("====\n")[0])
+        file.write_text(read_head(TEXTS / name))
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(robot_compiler, "load_plugins", lambda **_: plugins())
             return plan_of(file)

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from tests.kit.cases import read_lines
 from tests.remote.conftest import TEXTS, plugins
 
 from dxlrun.channels.answers import Completion
@@ -36,16 +37,13 @@ class Case(NamedTuple):
 
 def cases() -> Iterator[Any]:
     for path in sorted(TEXTS.glob("*.txt")):
-        lines = path.read_text("utf-8").splitlines()
-        first = lines.index("====") + 1
         states: dict[str, dict[str, float]] = {}
-        for number, line in enumerate(lines[first:], first + 1):
+        for place, line, _ in filter(lambda line: line.text, read_lines(path)):
             name, *words = line.split()
             if name in {"goals", "positions"}:
                 given = (word.partition("=") for word in words)
                 states = states | {name: {joint: float(value) for joint, _, value in given}}
                 continue
-            place = f"{path.name}:{number}"
             yield pytest.param(
                 Case(path.name, place, line, states), id=f"{place} {line.partition(' => ')[0][:60]}"
             )

@@ -8,10 +8,10 @@ import signal
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
 
 import pytest
 from tests.kit.awaited import until
+from tests.kit.cases import TextCase, read_cases
 from tests.kit.live_run import MOST_HELD, ROBOT, LiveRuns, Running, together
 
 from dxlrun_analysis.report import analyze
@@ -34,42 +34,33 @@ EXCEPTIONS = (
 SIGNALS = {"kill": signal.SIGKILL, "stop": signal.SIGSTOP}
 
 
-class Case(NamedTuple):
-    """Name with its line in the text, and the lines of a case."""
-
-    name: str
-    lines: list[str]
-
-    def of(self, word: str) -> list[str]:
-        """Return what follows a word in the lines that begin with it."""
-        return [line.removeprefix(word) for line in self.lines if line.startswith(word)]
-
-
-def read_groups() -> dict[str, list[Case]]:
+def read_groups() -> dict[str, list[TextCase]]:
     """Return the cases that run at the same time, by the name of their group."""
-    found: dict[str, list[Case]] = {}
-    cases: list[Case] = []
-    for number, line in enumerate(TEXT.read_text().splitlines(), 1):
-        if line.startswith("== "):
-            cases = found[line.removeprefix("== ")] = []
-        elif found and line.startswith("  "):
-            cases[-1].lines.append(line.strip())
-        elif found and line and not line.startswith("#"):
-            cases.append(Case(f"{TEXT.name}:{number}: {line}", []))
+    found: dict[str, list[TextCase]] = {}
+    for case in read_cases(TEXT):
+        if case.name.startswith("== "):
+            group = found[case.name.removeprefix("== ")] = []
+        else:
+            group.append(case)
     return found
 
 
-def begin(case: Case, runs: LiveRuns, folder: Path) -> Running:
+def lines_after(case: TextCase, word: str) -> list[str]:
+    """Return what follows a word in the lines that begin with it."""
+    return [line.text.removeprefix(word) for line in case.lines if line.text.startswith(word)]
+
+
+def begin(case: TextCase, runs: LiveRuns, folder: Path) -> Running:
     """Start the run of a case, in a folder of its own."""
     folder.mkdir()
     text = ROBOT
-    for change in case.of("robot: "):
+    for change in lines_after(case, "robot: "):
         right, _, wrong = change.partition(" => ")
         assert right in text or change.startswith("+ "), f"{right} is not in the robot"
         text = f"{text}{change[2:]}\n" if change.startswith("+ ") else text.replace(right, wrong)
     (folder / "robot.yaml").write_text(text)
-    options = " ".join(case.of("options: ")).split()
-    code = {word: line for word in ("configure", "update") for line in case.of(f"{word}: ")}
+    options = " ".join(lines_after(case, "options: ")).split()
+    code = {word: line for word in ("configure", "update") for line in lines_after(case, f"{word}: ")}
     where = {"robot": folder / "robot.yaml", "directory": folder}
     return runs.start_odd(*options, **code, **where) if code else runs.start(*options, **where)
 
@@ -193,13 +184,13 @@ CHECKS: dict[str, Callable[..., object]] = {
 }
 
 
-def check(case: Case, runs: LiveRuns, folder: Path) -> None:
+def check(case: TextCase, runs: LiveRuns, folder: Path) -> None:
     """Run a case and judge it."""
     run, hit_ns = begin(case, runs, folder), 0
-    for line in case.of("when "):
+    for line in lines_after(case, "when "):
         perform(run, line)
         hit_ns = time.monotonic_ns()
-    judge, said = Judge(run, hit_ns), case.of("=> ")
+    judge, said = Judge(run, hit_ns), lines_after(case, "=> ")
     for seen in said:
         assert judge.sees(seen), (seen, judge.code, judge.out, judge.err)
     judge.judge_rest(said)
@@ -211,6 +202,9 @@ GROUPS = read_groups()
 @pytest.mark.timeout(300)  # several runs
 @pytest.mark.parametrize("name", GROUPS)
 def test_ways_out_of_a_run(name: str, live_runs: LiveRuns, tmp_path: Path) -> None:
-    cases = {one.name: (one, live_runs, tmp_path / str(at)) for at, one in enumerate(GROUPS[name])}
+    cases = {
+        f"{one.place}: {one.name}": (one, live_runs, tmp_path / str(at))
+        for at, one in enumerate(GROUPS[name])
+    }
     assert cases
     together(check, cases)

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 from tests.kit import judges
+from tests.kit.cases import read_lines
 
 from dxlrun.channels.event_records import Event, EventCode, Severity
 from dxlsim.bus.ledger import LedgerEntry
@@ -26,8 +27,7 @@ LOOP = (
     Event(100 * MS, EventCode.LOOP_STARTED, Severity.INFO, "loop", ""),
     Event(90_000 * MS, EventCode.LOOP_STOPPED, Severity.INFO, "loop", ""),
 )
-TEXT = Path(__file__).with_name("ledger_judge.txt").read_text("utf-8")
-LINES = [line for line in TEXT.splitlines() if line and not line.startswith("#")]
+LINES = [line.text for line in read_lines(Path(__file__).with_name("ledger_judge.txt")) if line.text]
 SPLIT = LINES.index("uncaused")
 
 

@@ -1,13 +1,14 @@
 """Cases as text: what happens to a robot, and what a person would expect to read about it.
 
     weak_driver: mx_bulk x_sync x_three
-      # The line driver of one servo is dying: a bit of its replies is wrong now and then.
+      about: The line driver of one servo is dying: a bit of its replies is wrong now and then.
       from 1 s on 15 % of the replies of right_elbow have a wrong bit
       => not good
       => right_elbow: BROKEN
 
-A case has its name and its robots, then indented lines: `#` says what happens, `=>` what is expected, each
-other line does something (`injections.py` reads it; `[mx_bulk]` before it: on that robot). What is expected:
+The texts have the form of `tests/kit/cases.py`. A case has its name and its robots, then indented lines:
+`about:` describes what happens, each other line does something (`injections.py` reads it; `[mx_bulk]` before
+it: on that robot), and `=>` has what is expected:
 
     => good, => not good             without one, either way
     => left_elbow, right_knee: LATE  a sentence names them and says LATE (`WORDS`), or `: delay|slow`;
@@ -32,6 +33,7 @@ from typing import Any
 
 from tests.analysis.verdicts.injections import inject
 from tests.analysis.verdicts.rig import JOINTS, ROBOTS, Robot, Story
+from tests.kit.cases import read_cases as read_texts
 from tests.kit.totals import totals_of
 
 from dxlrun.log.log_reader import read_log
@@ -189,28 +191,20 @@ class Judged:
         return "\n    ".join((f"{self.verdict.word} {' '.join(self.wrong)} {accused}", *findings))
 
 
-def read_cases(file: Path) -> Iterator[Case]:
-    """Yield the cases of a text. Raises ValueError with file and line."""
-    case: Case | None = None
-    for number, text in enumerate(file.read_text("utf-8").splitlines(), 1):
-        place, line = f"{file.name}:{number}", text.strip()
-        if text and not text.startswith(" "):
-            if case:
-                yield case
-            name, _, robots = text.partition(": ")
-            case = Case(name, tuple(robots.split()), place)
-            if not case.robots or set(case.robots) - set(ROBOTS):
-                raise ValueError(f"{place}: write NAME: ROBOTS, of {', '.join(ROBOTS)}")
-        elif line and case is None:
-            raise ValueError(f"{place}: a line before the first case")
-        elif line.startswith("# "):
-            case.happens += f" {line[2:]}"
-        elif line.startswith("=> "):
-            case.expect(line[3:])
-        elif line:
-            of = re.match(r"\[([\w ]+)\] ", line)
-            case.lines.append((place, of[1], line[of.end() :]) if of else (place, "", line))
-    if case:
+def read_cases(*paths: Path) -> Iterator[Case]:
+    """Yield the cases of texts. Raises ValueError with file and line."""
+    for name, robots, text in ((*one.name.partition(": ")[::2], one) for one in read_texts(*paths)):
+        case = Case(name, tuple(robots.split()), text.place)
+        if not case.robots or set(case.robots) - set(ROBOTS):
+            raise ValueError(f"{text.place}: write NAME: ROBOTS, of {', '.join(ROBOTS)}")
+        for place, line, _ in text.lines:
+            if line.startswith("about: "):
+                case.happens += line.removeprefix("about:")
+            elif line.startswith("=> "):
+                case.expect(line[3:])
+            else:
+                of = re.match(r"\[([\w ]+)\] ", line)
+                case.lines.append((place, of[1], line[of.end() :]) if of else (place, "", line))
         yield case
 
 

@@ -15,7 +15,7 @@ from tests.analysis.verdicts.cases import Case, read_cases
 from tests.kit.campaigns import campaign
 
 HERE = Path(__file__).parent
-CASES = [case for file in sorted(HERE.glob("*.txt")) if file.stem != "losses" for case in read_cases(file)]
+CASES = [*read_cases(*sorted({*HERE.glob("*.txt")} - {HERE / "losses.txt"}))]
 PAIRS = [(case, robot) for case in CASES for robot in case.robots]
 DRAWN = [(case, robot) for case, robot in PAIRS if not case.is_live and robot not in case.unnamed]
 LOSSES = list(read_cases(HERE / "losses.txt"))
@@ -59,9 +59,12 @@ def test_missing_and_late_replies_are_those_of_the_part_that_fails(
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        ("  swing\n", "bad.txt:1: a line before the first case"),
+        ("  swing\n", "bad.txt:1: write NAME: ROBOTS, of mx_bulk, mx_two"),
         ("some case: torso\n", "bad.txt:1: write NAME: ROBOTS, of mx_bulk, mx_two"),
-        ("some case: x_fast\n  # A.\n  swing wildly\n", "bad.txt:3: 'swing wildly' is no line of a case"),
+        (
+            "some case: x_fast\n  about: A.\n  swing wildly\n",
+            "bad.txt:3: 'swing wildly' is no line of a case",
+        ),
     ],
 )
 def test_mistake_in_a_case_is_named_with_its_line(text: str, told: str, tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from tests.kit.cases import TextCase, case_parameters, read_head
 
 from dxlwire.control_table import device_models
 from dxlwire.control_table.device_models import (
@@ -19,8 +20,8 @@ from dxlwire.control_table.device_models import (
 )
 from dxlwire.control_table.device_table import read_device_table
 
-TEXT = Path(__file__).with_name("device_mistakes.txt").read_text("utf-8")
-BOARD, CASES = TEXT.partition("\n")[2].split("====\n")
+TEXT = Path(__file__).with_name("device_mistakes.txt")
+BOARD = read_head(TEXT)
 
 
 @pytest.fixture(autouse=True)
@@ -48,10 +49,10 @@ def test_a_table_without_a_model_number_is_one_that_is_not_checked() -> None:
     assert table.model_number is None
 
 
-@pytest.mark.parametrize("case", re.findall(r".+\n  .+", CASES))
-def test_a_mistake_is_named(case: str) -> None:
-    change, sentence = case.split("\n  ")
-    before, _, after = change.replace("\\n", "\n").partition(" => ")
+@pytest.mark.parametrize("case", case_parameters(TEXT))
+def test_a_mistake_is_named(case: TextCase) -> None:
+    ((_, sentence, _),) = case.lines
+    before, _, after = case.name.replace("\\n", "\n").partition(" => ")
     assert before in BOARD
     with pytest.raises(ValueError, match=re.escape(sentence)):
         read_device_table(BOARD.replace(before, after, 1))

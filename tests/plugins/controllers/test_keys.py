@@ -18,11 +18,12 @@ from typing import Any
 
 import pytest
 import yaml
+from tests.kit.cases import read_cases
 
 from dxlrun import Controller
 from dxlrun_controllers.plugin import dxlrun_controllers
 
-LINES = Path(__file__).with_name("keys.txt").read_text("utf-8").splitlines()
+TEXT = Path(__file__).with_name("keys.txt")
 
 
 def parsed(text: str) -> Any:
@@ -35,15 +36,12 @@ def type_of(name: str) -> type[Controller[Any]]:
 
 
 def cases() -> Iterator[Any]:
-    name = keys = ""
-    for number, line in enumerate(LINES, 1):
-        if line and line[0] != " ":
-            name, _, keys = line.partition(" ")
-        elif line:
-            given, _, expected = line.strip().partition("=> ")
-            yield pytest.param(
-                name, parsed(keys), given, expected, id=f"{number}: {name} {given or expected}"
-            )
+    for case in read_cases(TEXT):
+        name, _, keys = case.name.partition(" ")
+        for place, line, _ in case.lines:
+            given, _, expected = line.partition("=> ")
+            title = f"{place}: {name} {given or expected}"
+            yield pytest.param(name, parsed(keys), given, expected, id=title)
 
 
 def prepare(controller: type[Controller[Any]], keys: dict[str, Any], given: str) -> None:
