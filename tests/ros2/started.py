@@ -53,7 +53,9 @@ class Robot:
 
     def __init__(self, place: Path, file: Path, rate: float, environment: Mapping[str, str]) -> None:
         self.name = name = file.stem
-        self.ledger, self.place, self.bus = place / f"{name}.ledger", place, plan_of(file).buses[0]
+        earlier = len([*place.glob(f"{name}*.ledger")])  # of this robot, before it was started anew
+        self.ledger = place / f"{name}_{earlier}.ledger"
+        self.place, self.bus = place, plan_of(file).buses[0]
         self._read, self._sent = 0, list[wire.Instruction]()
         program = Path(sys.executable).with_name("dxlrun")
         command = [program, file, f"rate:={rate}", "--ledger", self.ledger, "--duration", "7200"]

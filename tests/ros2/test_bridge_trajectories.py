@@ -57,7 +57,7 @@ def test_a_trajectory_becomes_the_goal_of_some_joints() -> None:
 points = [at(0, positions=[9, 9]), at(0.5, positions=[1, 2], velocities=[3, 4])]
 points.append(at(1, positions=[5, 6], velocities=[0, 0], accelerations=[0, 1]))
 plan = wanted(trajectory(["roll", "pan"], *points), JOINTS, 100.0)
-print(json.dumps([plan.command(), plan.chunk(50.0)]))""")
+print(json.dumps([plan.build_command(), plan.chunk(50.0)]))""")
     first = {"time": 0.5, "positions": [1, 2], "velocities": [3, 4]}
     last = {"time": 1.0, "positions": [5, 6], "velocities": [0, 0], "accelerations": [0, 1]}
     assert goal == {"points": [first, last], "joints": ["roll", "pan"], "start_in": 0.0}
@@ -85,7 +85,7 @@ WRONG = {
     'trajectory(["pan"], at(1, positions=[0], accelerations=[0, 1]))': "2 accelerations",
     'trajectory(["pan"], at(1, positions=[float("nan")]))': "NaN or infinite",
     'trajectory(["pan"], at(1, positions=[0]), at(1, positions=[0]))': "increase from point to point",
-    'trajectory(["pan"], at(-1, positions=[0]))': "at least 0",
+    'trajectory(["pan"], at(-1, positions=[0]))': "must not be negative",
 }
 
 

@@ -388,8 +388,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         """Abort the goal if its first point is too far away for its time; return True if it was aborted.
 
         The check needs the present position, so it is only possible when the goal starts. A first point at
-        time 0
-        must be reachable within one period.
+        time 0 must be reachable within one period. The goal has no error, as its joints never left a path.
         """
         trajectory, period_s = self._trajectory, self.context.period_ns * 1e-9
         way = np.abs(trajectory.first_way(self._path)) * self._moved * self._speed
@@ -409,7 +408,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         )
         goal, self._goal = self._goal, None
         if goal is not None:
-            goal.end(Outcome.ABORTED, text, joint, float(way[row]))
+            goal.end(Outcome.ABORTED, text, joint)
         return True
 
     def _end_goal(self, outcome: Outcome, time_ns: int, text: str = "", row: int = -1) -> None:

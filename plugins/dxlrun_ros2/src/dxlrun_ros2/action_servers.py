@@ -39,8 +39,6 @@ _CYCLE_S = 0.01
 """Polling period while the record of a goal's last cycle is awaited, s"""
 _MEASURED_S = 5.0
 """Longest wait for the record of the cycle in which a goal ended, s"""
-_AT_ONCE = 3
-"""A goal that ends within this number of periods of the loop was invalid from the start."""
 Seen: TypeAlias = tuple[int, float, Floats, Floats]
 """State of a trajectory's joints in one cycle: time (ns since 1970), time since the goal was accepted (s),
 desired and measured positions and velocities (shape (2, joints))"""
@@ -218,9 +216,7 @@ class FollowTrajectory(Action):
         """Return the error code of FollowJointTrajectory for a goal that was not reached."""
         if state.status == "missed":
             return int(Result.GOAL_TOLERANCE_VIOLATED)
-        # A goal that is invalid from the start ends within a few periods.
-        began = (state.seconds or 0.0) > _AT_ONCE * self.run.header.period_ns * 1e-9
-        left = state.status == "aborted" and state.error is not None and began
+        left = state.status == "aborted" and state.error is not None  # one that never began has no error
         return int(Result.PATH_TOLERANCE_VIOLATED if left else Result.INVALID_GOAL)
 
 
