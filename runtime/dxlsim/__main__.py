@@ -113,8 +113,11 @@ def main(words: Sequence[str] | None = None) -> int:
         bus = _with_latency(bus_of_servos(given.servo, given.baud, given.protocol), given.latency_timer)
         links = {} if given.link is None else {bus.name: str(given.link)}
         config = SimulationConfig((bus,), tuple(given.fault), given.seed, links)
-        with Ledger(_open_ledger(given.ledger), keep=False) as ledger:
-            _serve(config, ledger)
+        with (
+            wake_on_signals(signal.SIGINT, signal.SIGTERM) as wake,  # until the ledger is written
+            Ledger(_open_ledger(given.ledger), keep=False) as ledger,
+        ):
+            _serve(config, ledger, stop=wake.fileno())
     except (InputError, OSError) as error:
         print(error, file=sys.stderr)
         return 2
@@ -141,7 +144,7 @@ def _with_latency(bus: BusConfig, text: str | None) -> BusConfig:
     return replace(bus, adapter=replace(bus.adapter, latency_timer_ns=timer_ns))
 
 
-def _serve(config: SimulationConfig, ledger: Ledger) -> None:
+def _serve(config: SimulationConfig, ledger: Ledger, *, stop: int) -> None:
     (bus,) = config.buses
     link = config.links.get(bus.name)
 
@@ -153,9 +156,7 @@ def _serve(config: SimulationConfig, ledger: Ledger) -> None:
         if message.happened is not None:
             print(f"fault: {message.happened}", flush=True)
 
-    starter = LocalStarter(show_ports)
-    with wake_on_signals(signal.SIGINT, signal.SIGTERM) as wake:
-        Server(config, ledger, starter).serve_ports(stop=wake.fileno())
+    Server(config, ledger, LocalStarter(show_ports)).serve_ports(stop=stop)
 
 
 def _text_of(bus: BusConfig) -> str:

@@ -150,7 +150,7 @@ def test_program_serves_until_a_signal(tmp_path: Path, number: signal.Signals) -
     ],
 )
 def test_program_refuses_wrong_words_and_helps(words, sentence, capsys) -> None:
-    code = 0
+    code, before = 0, signal.getsignal(signal.SIGINT)
     try:
         code = main([word.replace("+", " ") for word in words.split()]) or 0
     except SystemExit as ended:
@@ -158,3 +158,4 @@ def test_program_refuses_wrong_words_and_helps(words, sentence, capsys) -> None:
     said = capsys.readouterr()
     helps = words.startswith("--help") or words == "--faults"
     assert (code, sentence in (said.out if helps else said.err)) == (0 if helps else 2, True)
+    assert signal.getsignal(signal.SIGINT) is before

@@ -35,7 +35,10 @@ def main() -> int:
     job, starter = child_processes.begun(SimulationJob, Decoder(SimulationRequest))
     for text in dict.fromkeys(text for bus in job.config.buses for text in bus.control_tables):
         add_control_table(text)
-    with open_ledger(Path(job.ledger) if job.ledger else None) as ledger:
+    with (
+        wake_on_signals(signal.SIGTERM) as wake,  # until the ledger is written
+        open_ledger(Path(job.ledger) if job.ledger else None) as ledger,
+    ):
         try:
             shafts = None if job.shafts < 0 else SlotWriter(mapped(job.shafts))
             progress = None if job.progress < 0 else SimulationProgress(job.progress)
@@ -49,8 +52,7 @@ def main() -> int:
         granted = realtime_serving.prepare_process(job.priority, job.core)
         if job.priority or job.core >= 0:
             ledger.add(server.start_ns, "", "note", note=f"real time: {granted}")
-        with wake_on_signals(signal.SIGTERM) as wake:
-            server.serve_ports(granted, wake.fileno())
+        server.serve_ports(granted, wake.fileno())
     if ledger.error is None:
         return 0
     print(ledger.error, file=sys.stderr)

@@ -7,7 +7,7 @@ import select
 import signal
 import socket
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 
@@ -335,14 +335,21 @@ class _ServedLine:
         self._progress.publish_delivery(now_ns - self._bus.lateness_ns[-1], now_ns)
 
 
-def wake_on_signals(*numbers: signal.Signals) -> socket.socket:
-    """Return a socket that becomes readable after one of these signals, and disable their other effects."""
+@contextlib.contextmanager
+def wake_on_signals(*numbers: signal.Signals) -> Iterator[socket.socket]:
+    """Context with a socket that becomes readable after one of these signals, whose other effects are
+    disabled meanwhile."""
     wake, signalled = socket.socketpair()
-    signalled.setblocking(False)
-    for number in numbers:
-        signal.signal(number, lambda number, frame: None)
-    signal.set_wakeup_fd(signalled.detach())
-    return wake
+    with wake, signalled:
+        signalled.setblocking(False)
+        handlers = {number: signal.signal(number, lambda number, frame: None) for number in numbers}
+        woken = signal.set_wakeup_fd(signalled.fileno())
+        try:
+            yield wake
+        finally:
+            signal.set_wakeup_fd(woken)
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
 
 
 def servo_looks(bus: SimulatedBus, now_ns: int) -> list[ServoLook]:
