@@ -271,7 +271,10 @@ def running(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[subproc
 
 
 def test_messages_come_live_until_the_run_ends_and_are_all_in_the_log(
-    running: subprocess.Popen[bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    running: subprocess.Popen[bytes],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    request: pytest.FixtureRequest,
 ) -> None:
     def lives() -> None:
         assert running.poll() is None
@@ -284,6 +287,7 @@ def test_messages_come_live_until_the_run_ends_and_are_all_in_the_log(
             robot.newest("/count/states")
         found = []
         sleeper = robot.listen("/count/state", "/joint_states")  # takes nothing before the end
+        request.addfinalizer(sleeper.close)
         killed = subprocess.Popen([sys.executable, "-c", LISTENER], stdout=subprocess.PIPE)
         assert killed.stdout is not None
         killed.stdout.readline()
