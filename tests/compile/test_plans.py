@@ -22,6 +22,7 @@ from dxlwire.joint_unit import LINEAR
 from dxlwire.plan import planning
 
 ROBOTS = sorted({*CASES.glob("*.txt")} - {CASES / "controllers.txt"})  # whose section is empty
+PHYSICS = pytest.mark.needs("physics")
 MECHANICS = robot_text("mechanics")
 POLICIES = robot_text("policies")
 HUMANOID = Path(__file__).parents[2] / "robots" / "humanoid_20.yaml"
@@ -29,7 +30,15 @@ BUSES = ["right_arm", "left_arm", "right_leg", "left_leg"]
 
 
 @pytest.mark.usefixtures("part_plugins")
-@pytest.mark.parametrize("path", ROBOTS, ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path",
+    [
+        pytest.param(
+            path, id=path.stem, marks=PHYSICS if "physics: mujoco" in path.read_text("utf-8") else ()
+        )
+        for path in ROBOTS
+    ],
+)
 def test_plan_of_each_robot_is_the_same_after_json(path: Path) -> None:
     compiled, problems = compile_cases(whole_text(path.read_text("utf-8").partition("====\n")[0]))
     assert compiled is not None, problems

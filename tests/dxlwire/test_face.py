@@ -21,7 +21,7 @@ from dxlwire import dialect_of
 
 README = Path(dxlwire.__file__).with_name("README.md")
 OWN = Path(__file__).parent
-KIT = [OWN.parent / f"kit/{name}.py" for name in ("exchanges", "plans")]
+KIT = [OWN.parent / f"kit/{name}.py" for name in ("cases", "exchanges", "plans")]
 
 
 @pytest.fixture
@@ -91,4 +91,4 @@ def test_tests_of_dxlwire_need_neither_runtime_nor_simulation() -> None:
     own = {name for names in found.values() for name in names if name.split(".")[0] in ("dxlrun", "dxlsim")}
     assert own == set()
     kit = {name for names in found.values() for name in names if name.startswith("tests.")}
-    assert kit == {"tests.kit.awaited", "tests.kit.exchanges", "tests.kit.plans"}
+    assert kit == {"tests.kit.awaited", "tests.kit.cases", "tests.kit.exchanges", "tests.kit.plans"}
