@@ -337,8 +337,7 @@ class _ServedLine:
 
 @contextlib.contextmanager
 def wake_on_signals(*numbers: signal.Signals) -> Iterator[socket.socket]:
-    """Context with a socket that becomes readable after one of these signals, whose other effects are
-    disabled meanwhile."""
+    """Context with a socket that becomes readable after one of these signals, which have no other effect."""
     wake, signalled = socket.socketpair()
     with wake, signalled:
         signalled.setblocking(False)
