@@ -36,11 +36,11 @@ PLATFORMS = ("manylinux_2_17_aarch64", "manylinux2014_aarch64", "manylinux_2_28_
 BINFMT = Path("/proc/sys/fs/binfmt_misc")
 RUN = "dxlrun robots/bioloid_torso.yaml --play robots/motions/three_parts.yaml"
 TESTS = (
-    "tests/run/channels tests/sensors/test_slot.py tests/compile/test_cross_checks.py "
+    "tests/run/channels tests/sensors/test_slot.py tests/compile/test_{cases,limits}.py "
     "tests/dxlwire/test_{protocol1,protocol2,receiver,bus}.py "
     "tests/dynamixel/test_{kernel,kernel_rules,goals,samples}.py "
     "tests/control/test_{gate,loop,manager}.py "
-    "tests/log/test_{schemas_and_cdr,packet_messages,log,recorder}.py"
+    "tests/log/test_{messages,log,recorder}.py"
 )
 """The exchange with its kernel, what processes share, gate and loop, checks of robot files, the log."""
 INSIDE = """cd "$0" && for one in proc sys dev; do mount --rbind /$one $one || exit; done
