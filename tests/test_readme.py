@@ -20,7 +20,6 @@ from tests.kit.commands import Dxlrun, Said
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
-BIN = Path(sys.executable).parent
 ACTIVATE = ". .venv/bin/activate"
 COMMANDS = [line.strip() for line in README.splitlines() if line.startswith("    ")]
 FIRST = COMMANDS[0].split(" && ")[-1]
@@ -43,7 +42,7 @@ Begin = Callable[[str], "subprocess.Popen[str]"]
 @pytest.fixture
 def begin(clone: Path) -> Iterator[Begin]:
     """Run a line as in a new terminal of the reader's: no environment is active."""
-    path = ":".join(one for one in os.environ["PATH"].split(":") if Path(one) != BIN)
+    path = ":".join(one for one in os.environ["PATH"].split(":") if not (Path(one) / "dxlrun").exists())
     with ExitStack() as stack:
 
         def begin(line: str) -> subprocess.Popen[str]:
