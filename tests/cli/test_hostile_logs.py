@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from tests.kit.anew import plan, written_anew
+from tests.kit.changed_logs import plan, write_changed
 
 from dxlrun.cli import main
 from dxlrun.testing import simulated_robot
@@ -101,7 +101,7 @@ def test_no_verb_executes_a_log_or_leaves_its_folder(
     for name in ("still.py", "good.yaml"):
         (work / name).write_text((honest / name).read_text())
     monkeypatch.chdir(work)
-    written_anew(honest / "run.mcap", work / "bad.mcap", plan(edit(attack, outside)))
+    write_changed(honest / "run.mcap", work / "bad.mcap", plan(edit(attack, outside)))
     before = set(tmp_path.rglob("*"))
     for line in (READERS * (attack == "other code") + "\n" + REPLAYS).strip().splitlines():
         code = main(line.split())
@@ -118,7 +118,7 @@ def test_same_log_is_executed_when_it_is_trusted(
     honest: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    written_anew(honest / "run.mcap", Path("bad.mcap"), plan(edit("other code", tmp_path)))
+    write_changed(honest / "run.mcap", Path("bad.mcap"), plan(edit("other code", tmp_path)))
     assert main(["replay", "bad.mcap", "--json"]) == 2
     assert "--code log" in json.dumps(json.loads(capfd.readouterr().out))
     assert not Path("executed").exists()

@@ -19,7 +19,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
-from tests.kit.anew import written_anew
+from tests.kit.changed_logs import write_changed
 
 from dxlrun.control.deadlines import Deadlines
 from dxlrun.errors import InputError, LogError
@@ -323,7 +323,7 @@ def test_the_log_gives_the_same_result_again_and_other_tools_read_it(log):
 
 def test_a_log_whose_description_is_damaged_is_one_sentence(log, tmp_path):
     def read(**other):
-        return open_log(written_anew(log[0], tmp_path / "other.mcap", lambda read: replace(read, **other)))
+        return open_log(write_changed(log[0], tmp_path / "other.mcap", lambda read: replace(read, **other)))
 
     with pytest.raises(LogError, match="the details of the measurement cannot be read"):
         latency_log.measurement(read(metadata={"latency": {"about": "{"}}))

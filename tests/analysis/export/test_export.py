@@ -16,8 +16,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from msgspec import structs
-from tests.kit.anew import written_anew
 from tests.kit.answers import result_of
+from tests.kit.changed_logs import write_changed
 from tests.kit.commands import Dxlrun, Said
 from tests.kit.pages import page_text
 
@@ -411,7 +411,7 @@ def test_a_topic_of_any_name_is_exported_or_refused_in_a_sentence(
     run: Path, tmp_path: Path, export: Export, topic: str, to: str
 ) -> None:
     log, out = tmp_path / "odd.mcap", tmp_path / "out" / "out"
-    written_anew(run, log, lambda read: renamed(read, topic))
+    write_changed(run, log, lambda read: renamed(read, topic))
     out.parent.mkdir()
     said = export(log, out, to)
     assert "internal error" not in said.err

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.kit.anew import put, written_anew
 from tests.kit.answers import result_of
 from tests.kit.campaigns import campaign
+from tests.kit.changed_logs import put, write_changed
 
 from dxlrun import ROTARY
 from dxlrun.errors import InputError
@@ -273,7 +273,7 @@ def test_a_state_that_is_not_valid_is_no_position(swing: Path, tmp_path: Path) -
     """A position beside a lost reply is the one before it; a loss of more than 1 s is no motion."""
     pan, tilt = (read_log(swing).joints.index(joint) for joint in ("pan", "tilt"))
     lost = (put("valid", (slice(50, 81), pan), False), put("valid", (slice(120, 251), tilt), False))
-    written_anew(swing, tmp_path / "lost.mcap", *lost)
+    write_changed(swing, tmp_path / "lost.mcap", *lost)
     usual = read_motion(swing, what="states", only=["pan"])
     found = read_motion(tmp_path / "lost.mcap", what="states", only=["pan"])
     gone = (usual.time_s > 0.495) & (usual.time_s < 0.805)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from tests.kit.anew import written_anew
+from tests.kit.changed_logs import write_changed
 from tests.kit.packages import plugin_folder
 
 from dxlrun.testing import VirtualRobot, simulated_robot
@@ -144,8 +144,8 @@ def run(robot_file: Path, tmp_path: Path) -> Callable[..., Path]:
 
 @pytest.fixture
 def changed(tmp_path: Path) -> Callable[..., Path]:
-    """Write a log anew with something changed: see tests/kit/anew.py."""
-    return lambda path, *changes, gaps=(): written_anew(path, tmp_path / "changed.mcap", *changes, gaps=gaps)
+    """Write a changed copy of a log; tests/kit/changed_logs.py has the changes."""
+    return lambda path, *changes, gaps=(): write_changed(path, tmp_path / "changed.mcap", *changes, gaps=gaps)
 
 
 @pytest.fixture(scope="session")

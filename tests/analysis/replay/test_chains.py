@@ -17,8 +17,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from tests.kit.anew import flip, plan
 from tests.kit.campaigns import campaign
+from tests.kit.changed_logs import flip, plan
 from tests.kit.packages import plugin_folder
 from tests.kit.stories import Asked, ask, differing, replayed, send, silence, switch, tell
 

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from tests.kit.anew import no_commands, put, versions
 from tests.kit.answers import result_of
+from tests.kit.changed_logs import no_commands, put, versions
 from tests.kit.pages import page_text
 
 from dxlrun.cli import main

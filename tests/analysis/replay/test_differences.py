@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 import pytest
 from msgspec import structs
-from tests.kit.anew import Change, add, flip, messages, plan, put
+from tests.kit.changed_logs import Change, add, flip, messages, plan, put
 from tests.kit.stories import differing
 
 import dxlrun_lab.commands.replay

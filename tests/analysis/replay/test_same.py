@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.kit.anew import command, edited
 from tests.kit.campaigns import campaign
+from tests.kit.changed_logs import command, edited
 from tests.kit.examples import as_parameters
 from tests.kit.stories import differing, replayed, silence
 

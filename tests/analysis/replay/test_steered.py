@@ -16,8 +16,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from msgspec import structs
-from tests.kit.anew import Change, command, flip, no_commands, without
 from tests.kit.campaigns import campaign
+from tests.kit.changed_logs import Change, command, flip, no_commands, without
 from tests.kit.stories import Asked, ask, differing, rate, replayed, send, silence, switch, torque
 from tests.kit.stories import tell as tell_story
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from msgspec import structs
-from tests.kit.anew import Change, add, no_commands, only, plan, plan_text, versions, without
+from tests.kit.changed_logs import Change, add, no_commands, only, plan, plan_text, versions, without
 from tests.kit.judges import joints_of
 from tests.kit.stories import replayed
 

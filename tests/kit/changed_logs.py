@@ -1,8 +1,8 @@
-"""A log written anew with something changed in it; everything else stays as it was, bit for bit.
+"""Changed copies of logs: what is not changed stays the same, bit for bit.
 
-    written_anew(log, tmp_path / "changed.mcap", flip("goal_position", cycle=9, row=2), only(slice(20)))
+    write_changed(log, tmp_path / "changed.mcap", flip("goal_position", cycle=9, row=2), only(slice(20)))
 
-Each change takes a log as it was read, and returns it as it is to be written.
+A change maps the log that was read to the log that is written.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ Change = Callable[[Log], Log]
 OWN_METADATA, OWN_ATTACHMENT = ("dxlrun", "dxlrun_summary"), "header.json"
 
 
-def written_anew(path: Path, target: Path, *changes: Change, gaps: Sequence[tuple[str, int]] = ()) -> Path:
-    """Write the log at `path` to `target`, with all changes; `gaps`: rings and records that they lost."""
+def write_changed(path: Path, target: Path, *changes: Change, gaps: Sequence[tuple[str, int]] = ()) -> Path:
+    """Write a changed copy of a log to `target`; `gaps`: rings and how many records each of them lost."""
     log = read_log(path)
     for change in changes:
         log = change(log)
