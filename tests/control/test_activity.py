@@ -12,7 +12,7 @@ from contextlib import suppress
 from functools import partial
 
 import pytest
-from tests.kit.loops import Scripted, on_update
+from tests.kit.loops import Scripted
 
 from dxlrun.channels.event_records import EventCode
 from dxlrun.channels.heartbeat import ControllerMethod, Heartbeat, create
@@ -78,12 +78,6 @@ def test_what_a_controller_starts_while_the_robot_runs_is_refused_and_its_fault(
     assert fault.startswith(result.detail)
     assert ("Traceback" in fault) == (start is not swallowed)
     assert children() == before
-
-
-def test_the_others_go_on_and_the_fallback_takes_over(robot):
-    robot.script("odd", on_update(lambda *_: thread()), fallback="spare").script("spare", active=False)
-    assert robot.run(5).reason == "stopped"
-    assert robot.active(4) == ["spare"]
 
 
 def test_processes_are_for_on_configure_and_threads_of_others_are_theirs(robot):
@@ -196,21 +190,6 @@ def test_the_page_names_what_is_called_until_it_returns(page):
     assert seen[: len(calls)] == [f"{call} of controller arm" for call in calls]
     assert seen[len(calls)].startswith("__init__ of controller h\u00e4ndh\u00e4nd")
     assert page.beats == page.cycles == 0
-
-
-@pytest.mark.parametrize("at", ["activate", "update", "command", "deactivate"])
-def test_a_controller_is_shown_while_it_is_called(robot, page, at):
-    seen = []
-
-    def act(controller, step, time_ns, value):
-        if step == at:
-            seen.append(page.activity)
-
-    robot.script("arm", act).send(20_000_000, "arm", "go", 1.0)
-    robot.run(3, activity=Activity(page))
-    name = at if at == "update" else f"on_{at}"
-    assert set(seen) == {f"{name} of controller arm"}
-    assert not page.activity
 
 
 def test_a_child_that_foreign_machine_code_forked_ends_with_the_call(page):

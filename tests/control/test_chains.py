@@ -35,13 +35,6 @@ def test_joints_of_both_ends_are_matched_by_their_names(joints):
     assert first(robot) == [wanted[joint] if joint in joints else 0.25 for joint in robot.names]
 
 
-def test_two_controllers_meet_in_one_on_different_joints():
-    robot = Robot(joints=3).script("lower", following, **LOWER)
-    for name, joint, value in (("left", "j0", 0.4), ("right", "j2", 0.5)):
-        robot.script(name, commanding(position=value), joints=(joint,), **UPPER)
-    assert first(robot)[::2] == [0.4, 0.5]
-
-
 def test_two_controllers_meet_in_one_on_different_interfaces_of_a_joint(robot):
     def sums(context, *_):
         references = context.references
@@ -51,13 +44,6 @@ def test_two_controllers_meet_in_one_on_different_interfaces_of_a_joint(robot):
     robot.script("path", commanding(position=0.25), **UPPER)
     robot.script("gravity", commanding(effort=0.125), command=("effort",), into=("lower",))
     assert first(robot) == [0.375, 0.375]
-
-
-def test_three_in_a_chain_are_updated_from_the_top_wherever_they_are_in_the_file(robot):
-    robot.script("middle", following, into=("bottom",), **LOWER).script("bottom", following, **LOWER)
-    robot.script("top", commanding(position=0.7), into=("middle",), **CHAINED).run(2)
-    assert robot.order("update") == ["top", "middle", "bottom"] * 2
-    assert robot.sink.cycles[0]["position"].tolist() == [0.7, 0.7]
 
 
 def test_a_controller_sees_its_references_and_what_it_commands(robot):
@@ -95,13 +81,6 @@ def test_what_is_read_without_a_claim_is_of_this_cycle(robot):
     robot.run(1)
     here = float(states.position[1])
     np.testing.assert_allclose(seen[0], [0.3, here, 2.0, 0.003, NAN, 41.0, 0.5])
-
-
-@pytest.mark.parametrize("name", ["j7/position", "j0/torque", "upper/j0/position", "position", "a/b/c/d"])
-def test_what_is_not_there_cannot_be_read(robot, name):
-    robot.script("eye", joints=(), command=(), reads=(name,))
-    with pytest.raises(ControllerFault, match=f"controller eye reads {name}, but no source has it"):
-        robot.build()
 
 
 def test_a_reference_that_none_or_two_of_those_below_export_cannot_be_commanded(robot):

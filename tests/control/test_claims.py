@@ -11,13 +11,11 @@ from tests.kit.loops import plan_of
 from dxlrun.control.controllers.claims import (
     ControllerSnapshot,
     SwitchStep,
-    claimed_modes,
     conflicts,
     conflicts_text,
 )
 from dxlrun.control.controllers.update_order import lowers_first
 from dxlrun.plan.loop_plan import ControllerPlan
-from dxlwire.modes import Mode
 
 
 def wants(name: str, joints: Any, command: Any = ("position",), **more: Any) -> ControllerPlan:
@@ -60,18 +58,6 @@ def test_a_joint_is_claimed_at_the_one_that_exports_it():
     assert not conflicts([*lower, first, wants("second", ("a", "c"), into=("spare", "right"))])
     (found,) = conflicts([*lower, first, wants("second", ("a", "b"), into=("spare", "right"))])
     assert found.reference == "right/b/position"
-
-
-def test_a_chained_controller_leaves_the_servo_to_the_one_below():
-    assert not conflicts([wants("pid", ("a",)), wants("arm", ("a",), into=("pid",))])
-    assert claimed_modes(
-        [wants("pid", ("a",), command=("effort",)), wants("arm", ("a",), into=("pid",))]
-    ) == {"a": Mode.EFFORT}
-
-
-def test_a_broadcaster_conflicts_with_no_controller():
-    found = conflicts([wants("all", ("a",)), wants("eyes", ("a",), command=())])
-    assert (found, conflicts_text(found)) == ((), "")
 
 
 # Steps: what leaves and what enters, among any controllers
@@ -145,11 +131,6 @@ def takes_over(fallback: str, active: str = "", waiting: str = "", failed: tuple
     """Return how a fallback takes over for `high`."""
     engaged = [{name: ALL[name] for name in names.split()} for names in (active, waiting)]
     return ControllerSnapshot(ALL, *engaged).fall_back(fallback, ["high"], failed)
-
-
-def test_a_fallback_takes_over_from_those_below_the_one_that_failed():
-    assert takes_over("rest", "low", failed=("high",)) == SwitchStep(("low",), ("rest",))
-    assert takes_over("on_low", "low", failed=("high",)) == SwitchStep((), ("on_low",))
 
 
 @pytest.mark.parametrize(

@@ -513,12 +513,6 @@ def test_a_far_joint_takes_the_full_effort_when_a_kick_is_forgotten():
     assert efforts[-1] == -0.5
 
 
-@pytest.mark.parametrize(("dt_ns", "seconds"), [(PERIOD_NS, BRAKING_S), (200_000_000, 0.4)])
-def test_a_slow_loop_leaves_a_joint_two_periods_to_its_limit(dt_ns, seconds):
-    rig = GateRig(Mode.VELOCITY, velocity=2.0, start=0.95)
-    assert rig.apply(dt_ns, velocity=2.0).velocity == pytest.approx(0.05 / seconds)
-
-
 def test_a_joint_that_changes_its_mode_holds_until_it_is_commanded():
     rig = GateRig(Mode.VELOCITY)
     rig.apply(velocity=1.0)
@@ -573,13 +567,6 @@ def test_a_clamp_has_one_event_at_its_beginning_and_one_after_its_end():
     ]
     rig.apply(position=3.0)
     assert len(rig.texts) == 5
-
-
-def test_what_the_manager_found_not_finite_stays_flagged():
-    rig = GateRig(joints=2)
-    rig.record.clamped[1] = Clamp.NOT_FINITE | Clamp.STEP
-    rig.apply()
-    assert rig.record.clamped.tolist() == [0, Clamp.NOT_FINITE]
 
 
 LIGHT = SourcePlan(

@@ -22,6 +22,7 @@ class Judged:
     """Two joints at 0 rad, and the judge of their goals, cycle by cycle."""
 
     settle_ns: tuple[int, int] = (1_000_000_000, 1_000_000_000)
+    commands: CurrentCommands = field(default_factory=lambda: CurrentCommands(("a", "b")))
     events: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -33,7 +34,7 @@ class Judged:
         self.record.period_ns = PERIOD_NS
         self.states = self.record.states
         self.states.motion[:], self.states.valid[:], self.states.torque[:] = 0.0, True, Torque.ON
-        self.goals = GoalRegistry(self.record, self, plans, lambda controller: CurrentCommands(("a", "b")))
+        self.goals = GoalRegistry(self.record, self, plans, lambda controller: self.commands)
 
     def emit_event(self, source: str, event: EventBody, data: bytes = b"") -> None:
         self.events.append(event.text)
@@ -100,3 +101,13 @@ def test_a_limp_joint_aborts_only_the_missed_goals_that_move_it(joints, said, ou
     judged.states.torque[1] = Torque.RELEASED
     goal.end(Outcome.MISSED, said, "a", 0.2, joints)
     assert (goal.outcome, judged.events[-1]) == (outcome, text)
+
+
+@pytest.mark.parametrize(("commanded", "outcome"), [(0.0, "reached"), (0.03, "missed")])
+def test_a_joint_with_a_velocity_command_is_not_at_rest(commanded, outcome):
+    judged = Judged(commands=CurrentCommands(("a", "b"), velocities=np.array([0.0, commanded])))
+    goal = judged.accept()
+    goal.judge(np.full(2, NAN))
+    judged.cycles(60)
+    assert goal.outcome == outcome
+    assert ("b ends with a commanded velocity of 1.72 deg/s" in goal.text) == (commanded > 0)

@@ -7,7 +7,6 @@ import pytest
 from tests.kit.loops import PERIOD_NS, Robot, Scripted, commanding, on_update
 
 from dxlrun.channels.event_records import EventCode
-from dxlrun.control.controllers.managed import TRANSITIONS, ControllerEvent, State
 from dxlrun.errors import ControllerFault, PlugInError
 
 NAN = np.nan
@@ -17,12 +16,6 @@ OTHER = {"joints": ("j1",), "command": ("position",)}
 
 def last(robot, name):
     return robot.sink.cycles[-1][name].tolist()
-
-
-def test_two_active_controllers_cannot_have_one_joint(robot):
-    robot.script("first", command=("position",)).script("second", joints=("j1",), command=("velocity",))
-    with pytest.raises(ControllerFault, match="first and second both command joint j1"):
-        robot.build()
 
 
 def test_commands_of_several_controllers_are_merged_by_joint(robot):
@@ -91,12 +84,6 @@ def test_a_value_that_stops_being_finite_is_the_controllers_fault(robot, bad, wh
     assert what in result.detail
     assert robot.record.clamped.tolist() == [0, 16]
     np.testing.assert_array_equal(robot.record.goals.values[:2], [[0.26] * 2, [0.5] * 2])
-
-
-def test_infinity_is_a_fault_from_the_first_cycle(robot):
-    result = robot.script("wild", commanding(position=-np.inf)).run(9)
-    assert (result.reason, result.cycles) == ("fault", 1)
-    assert robot.record.goals.position.tolist() == [0.25] * 2
 
 
 class Stubborn(KeyboardInterrupt):
@@ -217,36 +204,3 @@ def test_joints_of_a_faulty_controller_stop_where_the_gate_last_let_them():
     assert robot.run(9, {2: robot.breaks("failing")}).cycles == 3
     np.testing.assert_allclose([position[0] for position, _ in robot.hardware.written], [0.27, 0.29, 0.29])
     assert np.isnan(last(robot, "position")).all()
-
-
-@pytest.mark.parametrize("state", State)
-def test_every_event_leads_from_every_state_to_another_or_is_a_fault(robot, state):
-    robot.script("one").build()
-    managed = robot.manager._named["one"]
-    for event in ControllerEvent:
-        managed.state, after = state, TRANSITIONS[state].get(event)
-        if after is not None:
-            managed.on(event)
-            assert managed.state is after
-            assert robot.record.active == (after is State.ACTIVE)
-            continue
-        assert event in (ControllerEvent.ENTER, ControllerEvent.COMMAND), (
-            "what is called without a fallback fits every state"
-        )
-        with pytest.raises(ControllerFault, match=f"one is {state.value}; {event.value} is invalid in"):
-            managed.on(event)
-        assert managed.state is state
-
-
-def test_a_command_for_a_controller_that_is_not_active_ends_no_loop_but_is_its_fault(robot):
-    """No way leads there; a mistake of this program is reported, and the run continues."""
-    robot.script("one").script("asleep", active=False).build()
-    manager, asleep = robot.manager, robot.manager._named["asleep"]
-    assert (
-        robot.run(3, {1: lambda: manager._attempt(asleep, asleep.give_command, "go", np.zeros(1))}).cycles
-        == 3
-    )
-    fault = ("asleep", "controller asleep is inactive; a command is invalid in this state")
-    assert robot.events.of(EventCode.CONTROLLER_FAULT) == [fault]
-    assert robot.active(2) == ["one"]
-    assert robot.result.reason == "stopped"

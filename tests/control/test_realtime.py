@@ -1,7 +1,6 @@
 """Wishes to the operating system: granted or refused in a plain sentence, never an exception."""
 
 import ctypes
-import gc
 import json
 import os
 import re
@@ -9,7 +8,6 @@ import resource
 import struct
 import subprocess
 import sys
-import threading
 
 import pytest
 from tests.kit.awaited import DEADLINE_S
@@ -104,12 +102,6 @@ def test_memory_is_not_locked_where_later_allocations_would_fail(asked, may):
     assert (grant.request, grant.granted) == ("locked memory", False)
     assert "memlock unlimited" in grant.fix
     assert asked == []
-
-
-def test_an_unlimited_allowance_is_enough_to_lock(asked, may):
-    may(memlock=resource.RLIM_INFINITY)
-    assert realtime_grants.apply_scheduler(SchedulerPlan("other", 31, True))[-1].granted
-    assert asked[-1 - len(SLICE)] == "mlockall"
 
 
 def invalid(*_):
@@ -391,25 +383,3 @@ def test_touched_memory_is_there_when_it_is_needed():
     """Arrays that come and go, each bigger than the one before: none misses a page once all was prepared."""
     assert outcome(FAULTS.format(before="")) > 100
     assert outcome(FAULTS.format(before="realtime_grants.keep_freed(); realtime_grants.touch_memory()")) < 10
-
-
-def test_the_collector_is_off_and_what_lives_is_frozen():
-    script = (
-        "import gc, json\nfrom dxlrun.control import realtime_grants\n"
-        "realtime_grants.freeze_collector()\n"
-        "print(json.dumps([gc.isenabled(), gc.get_freeze_count() > 1000]))\n"
-    )
-    assert outcome(script) == [False, True]
-    assert gc.isenabled()
-
-
-def test_a_thread_is_counted():
-    before = realtime_grants.thread_count()
-    go = threading.Event()
-    thread = threading.Thread(target=go.wait)
-    thread.start()
-    try:
-        assert realtime_grants.thread_count() == before + 1
-    finally:
-        go.set()
-        thread.join()

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.kit.loops import PERIOD_NS, Robot
@@ -72,14 +71,6 @@ def test_the_loop_is_behind_by_the_delay_of_that_cycle_alone(late, work):
     assert one.behind_ns.tolist() == one.delays_ns.tolist()
     assert one.times_ns.tolist() == (one.woken_ns - one.start_ns).tolist()
     assert len(one.number) + one.skipped == periods
-
-
-@pytest.mark.parametrize(("schedule", "behind"), [("sequential", 7 * PERIOD_NS // 2), ("absolute", 0)])
-def test_a_motion_of_a_hundred_periods_with_three_delays_ends(robot, schedule, behind):
-    late = [0] * 100
-    late[10], late[50], late[90] = PERIOD_NS // 2, 2 * PERIOD_NS, PERIOD_NS
-    one = ran(robot, schedule, 100, late)
-    assert one.behind_ns[-1] == behind
 
 
 def test_the_sequential_sender_can_be_paused_and_its_rate_changed(robot):

@@ -80,19 +80,6 @@ def test_a_message_has_the_time_of_the_cycle_and_nan_is_a_number():
     assert found["text"] == "well"
 
 
-def test_the_runtime_publishes_its_own_messages_the_same_way():
-    stage = Stage()
-    stage.goals.publish(state(1))
-    assert stage.read(0)["header"]["stamp"] == {"sec": 1_700_000_005, "nanosec": 7}
-
-
-def test_publishing_nothing_marks_the_cycle():
-    stage = Stage()
-    stage.topics.publish()
-    assert stage.record.published == 1
-    assert stage.sink.messages == []
-
-
 @pytest.mark.parametrize(
     ("topic", "message", "reason"),
     [
