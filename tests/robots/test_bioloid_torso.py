@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from functools import partial
 from pathlib import Path
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
@@ -46,27 +45,6 @@ def test_the_joints_are_those_of_the_table_cut_to_their_reach(torso):
         ends = sorted(direction * math.radians(theta - reference) for theta in (0, 300))
         assert joint.lower == pytest.approx(max(ends[0], urdf[0]))
         assert joint.upper == pytest.approx(min(ends[1], urdf[1]))
-
-
-def test_loop_bus_controllers_and_the_odd_twin(torso):
-    loop, (bus,) = torso.plan.loop, torso.plan.buses
-    scheduler = loop.scheduler
-    assert loop.period_ns == 20_000_000
-    assert (scheduler.policy, scheduler.priority, scheduler.lock_memory) == ("round_robin", 31, True)
-    assert (bus.port, bus.protocol, bus.baud_rate, bus.return_delay_ns) == ("sim", 1.0, 1_000_000, 500_000)
-    assert torso.plan.arguments == {"port": "sim", "rate": "50"}
-    assert {c.name: c.joints for c in loop.controllers if c.active and c.command} == {
-        "head": ("head_pitch_joint", "head_yaw_joint"),
-        "left_arm": tuple(row[0] for row in TABLE[:3]),
-        "right_arm": tuple(row[0] for row in TABLE[3:6]),
-    }
-    whole = {f"whole_body_{kind}" for kind in ("position", "posvel", "trajectory")}
-    assert {c.name for c in loop.controllers if not c.active} == whole
-    (broadcaster,) = [c for c in loop.controllers if c.publishes]
-    assert (broadcaster.active, broadcaster.every) == (True, 1)
-    (warning,) = torso.warnings
-    twins = "right_shoulder_lateral_joint is not a mirror image of left_shoulder_lateral_joint"
-    assert warning.what.startswith(twins)
 
 
 def left(t: float) -> list[float]:
@@ -137,28 +115,6 @@ def pose(joints: dict[str, Element], link: str, **angles: float) -> Matrix:
     return pose(joints, child(joint, "parent", "link"), **angles) @ frame @ turn
 
 
-def test_links_form_one_tree_below_the_world(root, joints):
-    links = [link.attrib["name"] for link in root.iter("link")]
-    assert len(links) == len(set(links))
-    assert set(links) - set(joints) == {"world"}
-    assert len(joints) == len(list(root.iter("joint"))) == len(links) - 1
-    for link in joints:
-        above, seen = link, set()
-        while above in joints:
-            assert above not in seen
-            seen.add(above)
-            above = child(joints[above], "parent", "link")
-        assert above == "world"
-
-
-def test_the_turning_joints_and_their_limits_are_the_thesis(joints):
-    turning = {joint.attrib["name"]: joint for joint in joints.values() if joint.get("type") == "revolute"}
-    limits = {
-        name: [float(child(one, "limit", end)) for end in ("lower", "upper")] for name, one in turning.items()
-    }
-    assert limits == {row[0]: pytest.approx(list(row[4]), abs=1e-6) for row in TABLE}
-
-
 @pytest.mark.parametrize(
     ("swing", "lateral", "elbow"), [(0, 0, 0), (0.4, 0, 0), (0, -0.7, 0), (0.3, 0.5, -1.2)]
 )
@@ -172,10 +128,3 @@ def test_equal_angles_make_mirror_images_of_the_arms(joints, swing, lateral, elb
 
     x, y, z, _ = hand("right")
     assert hand("left")[:3] == pytest.approx([-x, y, z], abs=1e-6)
-
-
-def test_at_zero_the_arms_point_sideways(joints):
-    at = partial(pose, joints)
-    hand = np.linalg.inv(at("torso_link")) @ at("left_lower_arm_link")
-    assert hand[0, 3] == pytest.approx(0.032 + 0.044 + 0.0675, abs=1e-6)
-    assert abs(hand[1:3, 3]) == pytest.approx([0.014, 0.0], abs=1e-6)

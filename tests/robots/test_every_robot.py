@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -60,10 +59,3 @@ def test_every_motion_runs_by_the_command_that_it_names(path, tmp_path):
             assert not bus.servo(servo.servo_id).torque_on
     # a limit of the position, never of the step in the first second, would be a mistake of the motion
     assert not (cycles["clamped"] & 0b11).any()
-
-
-def test_the_torso_is_described_in_its_log(tmp_path):
-    run = played(tmp_path, command_of(ROBOTS / "motions" / "whole_body_position.yaml"), 0.1)
-
-    assert json.loads(run.log.attachments["plan.json"])["loop"]["urdf"].startswith("<?xml")
-    assert run.log.attachments["included/bioloid_torso.yaml"] == (ROBOTS / "bioloid_torso.yaml").read_bytes()

@@ -99,12 +99,6 @@ def test_a_pid_controller_below_has_ten_times_less_to_do(tmp_path, interface):
     assert np.isfinite(log.cycles[f"goal_{interface}"][100:]).all()
 
 
-def test_efforts_alone_follow_the_motion_for_some_seconds(tmp_path):
-    """Without any feedback; PWM alone would be braked by the motor itself."""
-    found, _ = bench.tracked(tmp_path, bench.ALONE, bench.XM430, seconds=SECONDS)
-    assert found.rms < 0.02
-
-
 STORM = """\
 name: storm
 buses: {main: {port: sim, protocol: 1.0, baud_rate: 1_000_000, return_delay_time: 0 us}}

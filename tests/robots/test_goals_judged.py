@@ -11,9 +11,6 @@ from tests.kit.commands import Dxlrun
 from tests.kit.stories import Clients, prepared
 
 from dxlrun.channels.event_records import EventCode
-from dxlrun.compile.robot_compiler import compile_robot
-from dxlrun.description.motion import read_motion
-from dxlrun.description.reading import read_robot
 from dxlrun.testing import read_log, simulated_robot
 
 BUSES = """
@@ -87,20 +84,6 @@ def test_a_played_goal_that_is_aborted_at_once_fails_the_run(play):
     assert "failed: " in ran.out
     assert "elbow aborted the goal of its trajectory" in ran.out
     assert analyzed.out.splitlines()[0].startswith("Not good: ")
-
-
-def warnings(robot: Path, *motions: Path) -> list[str]:
-    """Return the warnings of a robot file with its motions."""
-    read = [read_motion(motion, {}) for motion in motions]
-    return [one.what for one in compile_robot(read_robot(robot, {}), read, None).warnings]
-
-
-def test_a_motion_that_turns_a_continuous_joint_the_longer_way_is_warned_of(tmp_path):
-    motion = written(tmp_path, FAR, "motion.yaml")
-    for wraps, warned in (("", 1), ("wrap: true, ", 0)):
-        robot = written(tmp_path, FAR_GOAL.replace("id: 1, ", f"id: 1, {wraps}"))
-        found = [text for text in warnings(robot, motion) if "turns by" in text]
-        assert found == ["reel turns by 458.4 deg from one point to the next"] * warned
 
 
 @pytest.mark.parametrize(("protocol", "model"), [(1.0, "MX-64"), (2.0, "XM430-W350")])
