@@ -85,26 +85,6 @@ def test_contract_example_runs_from_a_file(tmp_path: Path) -> None:
     assert np.ptp(np.degrees(position)) == pytest.approx(40, abs=2)
 
 
-def test_an_editable_install_finds_new_code_but_no_new_entry_point(fresh: Shell, package: Path) -> None:
-    install = next(line for line in COMMANDS if line.startswith("pip install -e"))
-    assert fresh(install, package).returncode == 0
-    source, project = package / "src/my_robotics/plugin.py", package / "pyproject.toml"
-    text, entries, robot = source.read_text(), project.read_text(), package / "example.yaml"
-    source.write_text(text.replace('"my_robotics_controller"', '"swing"'))
-    written = robot.read_text()
-    robot.write_text(written.replace("my_robotics_controller", "swing"))
-    assert fresh("dxlrun check example.yaml", package).returncode == 0
-    (package / "src/my_robotics/second.py").write_text(text.replace('"my_robotics_controller"', '"second"'))
-    point = 'my_robotics = "my_robotics.plugin"\n'
-    project.write_text(entries.replace(point, point + 'my_second = "my_robotics.second"\n'))
-    robot.write_text(written.replace("my_robotics_controller", "second"))
-    told = fresh("dxlrun check example.yaml", package)
-    assert (told.returncode, "no plug-in offers the controller type second" in told.stderr) == (2, True)
-    assert fresh(install, package).returncode == 0
-    assert fresh("dxlrun check example.yaml", package).returncode == 0
-    fresh("pip uninstall --yes my-robotics", package)
-
-
 def test_the_contract_of_the_page_is_the_contract(package: Path) -> None:
     assert f"This one has contract {CONTRACT_VERSION}:" in PAGE
     assert f"return {CONTRACT_VERSION}\n" in (package / "src/my_robotics/plugin.py").read_text()

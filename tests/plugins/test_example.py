@@ -55,12 +55,6 @@ def test_the_readmes_commands_end_well(fresh: Shell, copy: Path, line: str) -> N
     assert re.search(SAYS.get(line, ""), told.stdout)
 
 
-def test_the_whole_run_through_all_processes_ends_well(fresh: Shell, copy: Path) -> None:
-    told = fresh("dxlrun example.yaml --duration 0.5", copy)
-    assert told.returncode == 0, told.stderr
-    assert "easing_example: " in told.stdout
-
-
 def test_every_parameter_of_the_readme_is_one_of_the_model() -> None:
     tree = ast.parse((EXAMPLE / "src/dxlrun_easing/easing.py").read_text())
     law = next(node for node in ast.walk(tree) if isinstance(node, ast.ClassDef) and node.name == "Easing")

@@ -71,18 +71,6 @@ def test_three_short_controllers_run_and_replay_bit_for_bit(tmp_path: Path) -> N
     assert replay_log(log).sentence == "short: 100 cycles replayed, 0 differences"
 
 
-def test_the_law_is_the_formula_to_the_last_bit(written: Written) -> None:
-    written()
-    log = Path("run.mcap")
-    simulated_robot("robot.yaml", duration_s=0.5, log=log).run()
-    read = read_log(log)
-    start = read.activation[0]["goal_position"]
-    start = np.where(np.isnan(start), read.activation[0]["position"], start)
-    times = np.arange(25) * 20_000_000 * 1e-9
-    law = [start + 0.3 * np.sin(2 * np.pi * 2.0 * time) for time in times]
-    np.testing.assert_array_equal(read.cycles["command_position"], law)
-
-
 def test_the_log_has_the_file_and_a_replay_runs_the_same_one_on_the_disk(written: Written) -> None:
     file, log = written(), Path("run.mcap")
     simulated_robot(file, duration_s=0.3, log=log).run()

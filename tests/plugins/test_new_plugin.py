@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 from tests.kit.answers import result_of
+from tests.kit.packages import Install, installing
 
 from dxlrun.cli import main
 from dxlrun.cli.plugins import _NOT_COPIED
@@ -53,20 +53,9 @@ def said(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest
 
 
 @pytest.fixture
-def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str, str], None]]:
-    """Return a function that installs a plug-in, as pip would leave it."""
-    monkeypatch.syspath_prepend(tmp_path)
-
-    def put(name: str, source: str) -> None:
-        (tmp_path / f"{name}.py").write_text(source)
-        info = tmp_path / f"{name}-1.5.dist-info"
-        info.mkdir()
-        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.5\n")
-        (info / "entry_points.txt").write_text(f"[dxlrun]\n{name} = {name}\n")
-
-    yield put
-    for name in ("first_one", "broken_one"):
-        sys.modules.pop(name, None)
+def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install]:
+    with installing(tmp_path, monkeypatch) as install:
+        yield install
 
 
 def test_the_package_has_names_of_its_own_and_no_licence(said: Said, tmp_path: Path) -> None:
@@ -135,31 +124,31 @@ def test_what_is_there_already_stays(said: Said, tmp_path: Path) -> None:
     assert (list((tmp_path / "arms").iterdir()), (tmp_path / "file").read_text()) == ([], "mine")
 
 
-def test_plugins_are_listed_with_what_they_offer(said: Said, install: Callable[[str, str], None]) -> None:
-    install("first_one", PLUGIN.replace("CONTRACT", "1"))
-    install("broken_one", PLUGIN.replace("CONTRACT", "5"))
+def test_plugins_are_listed_with_what_they_offer(said: Said, install: Install) -> None:
+    install("first-one", "first_one", PLUGIN.replace("CONTRACT", "1"))
+    install("broken-one", "broken_one", PLUGIN.replace("CONTRACT", "5"))
     code, out, err = said("plugins")
     assert (code, err) == (0, "")
     lines = [line.split() for line in out.splitlines()]
-    assert ["first_one", "(first_one", "1.5,", "contract", "1)"] in lines
+    assert ["first_one_entry", "(first-one", "2.5,", "contract", "1)"] in lines
     assert ["mine", "position"] in lines
     assert ["decisions", "about", "late", "cycles"] in lines
     assert ["joint_trajectory_controller", "chunk", "trajectory"] in [line[:3] for line in lines]
     assert (
-        "broken: plug-in broken_one of broken_one 1.5 was written for contract 5, "
+        "broken: plug-in broken_one_entry of broken-one 2.5 was written for contract 5, "
         "but this dxlrun has contract 4; install a matching version"
     ) in out
 
 
-def test_the_list_for_programs(said: Said, install: Callable[[str, str], None]) -> None:
-    install("first_one", PLUGIN.replace("CONTRACT", "2"))
-    install("broken_one", "import no_such_thing")
+def test_the_list_for_programs(said: Said, install: Install) -> None:
+    install("first-one", "first_one", PLUGIN.replace("CONTRACT", "2"))
+    install("broken-one", "broken_one", "import no_such_thing")
     code, out, _ = said("plugins", "--json")
     found = {one["name"]: one for one in result_of(out)}
     assert code == 0
-    assert found["first_one"] == {
-        "name": "first_one",
-        "distribution": "first_one 1.5",
+    assert found["first_one_entry"] == {
+        "name": "first_one_entry",
+        "distribution": "first-one 2.5",
         "contract": 2,
         "controllers": [
             {
@@ -177,7 +166,7 @@ def test_the_list_for_programs(said: Said, install: Callable[[str, str], None]) 
         "verbs": [],
         "broken": "",
     }
-    assert "No module named 'no_such_thing'" in found["broken_one"]["broken"]
+    assert "No module named 'no_such_thing'" in found["broken_one_entry"]["broken"]
     sensors = {one["type"]: one["simulated"] for one in found["standard_controllers"]["sensors"]}
     assert sensors == {"serial_imu": False, "simulated_imu": True}
     standard = {one["type"]: one for one in found["standard_controllers"]["controllers"]}

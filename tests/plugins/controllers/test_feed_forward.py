@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +10,7 @@ from msgspec.structs import replace
 from tests.kit.stages import Stage
 
 from dxlrun import MotorLoad, MotorModel, Stribeck
-from dxlrun_controllers.feed_forward import FeedForward, FeedForwardParameters
+from dxlrun_controllers.feed_forward import FeedForward
 from dxlrun_controllers.laws.inverse_model import InverseServo, MotionAhead
 from dxlsim.motion.motor import identified_motor
 from dxlsim.motion.plant import IndependentJoints, PlantJoint
@@ -105,28 +104,14 @@ def test_the_state_is_published_fifty_times_a_second() -> None:
 
 
 @pytest.mark.parametrize(
-    ("parameters", "motors", "what"),
+    ("parameters", "motor", "what"),
     [
-        ({}, (MOTOR, None), "no motor file for "),
-        ({}, (MOTOR, replace(MOTOR, p_gain=0)), "the P gain of a servo is declared as 0"),
-        (
-            {"command_interface": "effort", "pass_on": True},
-            (MOTOR, MOTOR),
-            "pass_on needs the key `into`",
-        ),
+        ({}, replace(MOTOR, p_gain=0), "the P gain of a servo is declared as 0"),
+        ({"command_interface": "effort", "pass_on": True}, MOTOR, "pass_on needs the key `into`"),
     ],
 )
 def test_what_it_cannot_work_with_is_refused_at_the_start(
-    parameters: dict[str, object], motors: tuple[MotorModel | None, ...], what: str
+    parameters: dict[str, object], motor: MotorModel, what: str
 ) -> None:
     with pytest.raises(ValueError, match=what):
-        Stage(FeedForward, TWO | parameters, motors=motors)
-
-
-def test_the_interfaces_name_what_they_need_of_the_motors() -> None:
-    def of(**more: object) -> Any:
-        return FeedForward.interfaces(FeedForwardParameters.model_validate(TWO | more), ("a", "b"))
-
-    assert (of().command, of().motors) == (("position",), ("resistance", "position_gain"))
-    assert of(command_interface="effort").motors == ("resistance", "torque_per_effort")
-    assert of(command_interface="pwm", pass_on=True).command == ("position", "velocity", "pwm")
+        Stage(FeedForward, TWO | parameters, motors=(MOTOR, motor))

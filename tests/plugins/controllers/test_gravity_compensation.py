@@ -144,16 +144,6 @@ def test_positions_are_shifted_as_a_feed_forward_shifts_them() -> None:
 
 
 @pytest.mark.needs("physics")
-def test_what_was_not_heard_yet_is_not_held() -> None:
-    robot = started({})
-    robot.activate()
-    robot.states.valid[:] = (True, False)
-    assert np.isnan(robot.update(0.0, follow=False)).tolist() == [False, True]
-    robot.states.valid[:] = True
-    assert np.isfinite(robot.update(0.02, follow=False)).all()
-
-
-@pytest.mark.needs("physics")
 @pytest.mark.parametrize("interface", ["effort", "pwm"])
 def test_an_arm_floats_and_carries_what_is_commanded_beside(interface: str) -> None:
     robot = started({"command_interface": interface}, present=(0.5, -0.4))

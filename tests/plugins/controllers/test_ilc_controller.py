@@ -117,13 +117,6 @@ def test_the_error_falls_tenfold_in_ten_repetitions(interface: str) -> None:
     assert learner.said == [f"motion {messages[0].motion} is not learned yet: no correction"]
 
 
-def test_without_a_gain_nothing_is_learned() -> None:
-    learner = Learner(gain=0.0, repeated=2)
-    assert learner.errors[1] == pytest.approx(learner.errors[0], rel=0.01)
-    assert not learner.stage.keeps
-    assert not np.any(learner.corrections)
-
-
 @pytest.mark.parametrize(("keys", "delay_s"), [({}, 4 * PERIOD_S), ({"delay": "30 ms"}, 0.03)])
 def test_the_delay_is_that_of_the_first_repetition_unless_it_is_given(keys: Any, delay_s: float) -> None:
     learner = Learner(Servos(delay=3, lag_s=0.001), repeated=1, **keys)

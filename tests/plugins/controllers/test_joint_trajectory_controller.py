@@ -87,14 +87,6 @@ def test_what_all_points_give_decides_the_spline(order, missing):
     assert started().prepare("trajectory", points=given_points)[2] == order
 
 
-def test_times_may_have_units():
-    written = [
-        started().prepare("trajectory", points=one(1, time=time), start_in=start_in)
-        for time, start_in in ((0.5, 0.25), ("500 ms", "250 ms"))
-    ]
-    np.testing.assert_array_equal(*written)
-
-
 @pytest.mark.parametrize("interface", ["velocity", "effort"])
 def test_velocity_and_effort_follow_by_pid_and_feed_forward(interface):
     gains = {"p": 3.0, "d": 0.5, "acceleration": 0.2, "friction": 0.1}

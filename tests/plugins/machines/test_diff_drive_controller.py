@@ -13,7 +13,6 @@ from dxlrun_controllers.laws.odometry import BasePose, WheelAngles
 
 SEPARATION, RADIUS = 0.16, 0.033
 BASE = {"left": ["l"], "right": ["r"], "separation": "160 mm", "radius": "33 mm"}
-FOUR = BASE | {"left": ["l1", "l2"], "right": ["r1", "r2"]}
 SMOOTH = {
     "linear": {"velocity": "0.3 m/s", "acceleration": "0.5 m/s^2"},
     "angular": {"velocity": "2 rad/s", "acceleration": "4 rad/s^2"},
@@ -48,16 +47,6 @@ def on_arc(way, angle):
 
 
 # Kinematics
-
-
-@pytest.mark.parametrize("parameters", [BASE, FOUR])
-@pytest.mark.parametrize(("linear", "angular"), [(0.2, 0.0), (0.0, 1.0), (0.15, -0.7), (-0.1, 2.0)])
-def test_wheels_have_the_speeds_of_their_rims(parameters, linear, angular):
-    robot = driving(parameters, linear=linear, angular=angular)
-    count = len(parameters["left"])
-    across = angular * SEPARATION / 2
-    np.testing.assert_allclose(robot.commands.velocity[:count], (linear - across) / RADIUS)
-    np.testing.assert_allclose(robot.commands.velocity[count:], (linear + across) / RADIUS)
 
 
 @settings(max_examples=100, deadline=None)
@@ -239,13 +228,6 @@ def test_odometry_of_velocities_is_the_arc_too(source):
     x, y = on_arc(0.2 * 99 * 0.02, 0.5 * 99 * 0.02)
     found = robot.controller._pose
     np.testing.assert_allclose([found.x, found.y, found.heading], [x, y, 0.99], atol=1e-9)
-
-
-def test_messages_come_at_their_own_rate():
-    robot = base(BASE | {"odometry_rate": 20.0}, period_s=0.01)
-    robot.steps(200)
-    assert len(robot.messages) == pytest.approx(40, abs=1)
-    assert {topic for topic, _ in robot.messages} == {"odometry"}
 
 
 def test_after_a_long_time_turns_are_not_guessed():
