@@ -32,6 +32,7 @@ class ForeignViewer:
             origin=Origin(origin) if origin else None,
             compression=None,
             max_size=None,
+            max_queue=None,
             ssl=tls,
         )
         self.socket = self._opened.enter_context(asked)

@@ -10,7 +10,6 @@ import struct
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import ExitStack
 from pathlib import Path
 from typing import NamedTuple
 
@@ -131,20 +130,14 @@ def may_not_change(only_looks: ForeignViewer, steers: ForeignViewer) -> None:
 
 
 def check_noise_is_harmless(looks: Started, frames: int, draw: random.Random) -> None:
-    """Send fuzzed frames, handshakes without the token, and leave connections half open.
-
-    A viewer still gets in, and memory does not grow.
-    """
+    """Send fuzzed frames and handshakes without the token: a viewer still gets in, memory stays bounded."""
     fuzz.fuzz(looks.url, frames // 10, draw)
     fuzz.knock(looks.url, frames // 100, draw)
     before = looks.memory
     fuzz.fuzz(looks.url, frames, draw)
     fuzz.knock(looks.url, frames // 20, draw)
-    with ExitStack() as opened:
-        for one in fuzz.half_open(looks.url, frames // 1000):
-            opened.enter_context(one)
-        with ForeignViewer(looks.url) as viewer:
-            viewer.words("serverInfo")
+    with ForeignViewer(looks.url) as viewer:
+        viewer.words("serverInfo")
     assert looks.memory < before + 20.0, f"{before} MB before"
 
 
