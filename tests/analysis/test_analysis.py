@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from statistics import median
 
@@ -14,12 +13,9 @@ from rich.console import Console
 from tests.kit.made_logs import Cycle, Said, Wire
 
 from dxlrun.channels.event_records import EventCode, Severity
-from dxlrun.errors import LogError
-from dxlrun.log.log_reader import read_log
 from dxlrun.output.json import json_text
 from dxlrun.output.terminal import show_parts
 from dxlrun.output.text_table import Table, microseconds
-from dxlrun_analysis.cycles.punctuality import Durations, Punctuality
 from dxlrun_analysis.parts.cycles import CONTROLLERS, STEPS
 from dxlrun_analysis.parts.history import EVENTS
 from dxlrun_analysis.parts.part import Report
@@ -163,21 +159,6 @@ def test_without_known_limits_tracking_compares_with_the_goal_of_the_cycle_befor
     assert (head.rms_rad, head.invalid) == (None, 0)
 
 
-def test_slices_give_what_the_whole_log_gives(write: Write) -> None:
-    numbers = [n for n in range(120) if n not in (38, 39)]
-    cycles = [Cycle(n, late=(n * 37) % 900, read=4000 + n, skipped=2 * (n == 40)) for n in numbers]
-    log = read_log(write(cycles))
-    whole, sliced = (Punctuality(), Durations()), (Punctuality(), Durations())
-    for one in whole:
-        one.add_slice(log)
-    for begin in range(0, len(log.cycles), 7):
-        for one in sliced:
-            one.add_slice(replace(log, cycles=log.cycles[begin : begin + 7], activation=None))
-    assert sliced[0].compute_latency() == whole[0].compute_latency()
-    assert sliced[1].compute_durations() == whole[1].compute_durations()
-    assert sliced[0].slowest == whole[0].slowest
-
-
 # Servos and events
 
 
@@ -248,12 +229,6 @@ def test_json_carries_the_whole_report(write: Write) -> None:
 @pytest.mark.parametrize(("value", "text"), [(83.4, "83 us"), (16_949.0, "16.95 ms"), (2.5e6, "2.50 s")])
 def test_times_are_written_in_fitting_units(value: float, text: str) -> None:
     assert microseconds(value) == text
-
-
-def test_what_is_no_log_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "robot.yaml").write_text("name: torso\n")
-    with pytest.raises(LogError, match="not an MCAP file"):
-        analyze_log(tmp_path / "robot.yaml")
 
 
 def test_no_line_is_longer_than_the_terminal_or_than_reads_well(write: Write) -> None:

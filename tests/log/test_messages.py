@@ -283,28 +283,6 @@ def test_the_package_is_made_of_the_distribution(distribution: str, package: str
 # Messages of the log
 
 
-@settings(max_examples=60, deadline=None)
-@given(
-    st.tuples(st.integers(0, 2**31 - 1), st.integers(0, 10**9)),
-    TEXT,
-    st.lists(TEXT, max_size=4),
-    FLOATS,
-    FLOATS,
-)
-def test_joint_states_are_read_by_rosbags(
-    stamp: tuple[int, int], frame: str, names: list[str], position: list[float], effort: list[float]
-) -> None:
-    data = Codec(schemas.JOINT_STATE).pack(
-        (stamp, frame), names, np.array(position), np.zeros(0), np.array(effort)
-    )
-    message = read_by_rosbags(schemas.JOINT_STATE, data)
-    assert (message.header.stamp.sec, message.header.stamp.nanosec) == stamp
-    assert message.header.frame_id == frame
-    assert message.name == names
-    np.testing.assert_array_equal(message.position, position)
-    np.testing.assert_array_equal(message.effort, effort)
-
-
 @pytest.mark.parametrize(("joints", "controllers"), [(0, 0), (1, 0), (3, 1), (8, 3)])
 def test_a_cycle_record_is_the_message_as_it_is(joints: int, controllers: int, typestore: Typestore) -> None:
     layout = CycleLayout([f"j{i}" for i in range(joints)], [f"c{i}" for i in range(controllers)])

@@ -25,11 +25,6 @@ VISIBLE = "(selector => document.querySelector(selector).offsetParent !== null)"
 ENABLED = """[...document.querySelectorAll('fieldset :is(input, button, select)')]
   .filter(one => !one.matches(':disabled'))"""
 """In the page: the controls that steer the robot and can be used."""
-LABELS = """[...document.querySelectorAll(
-  'button, th, dt, label, optgroup, #phase, #kind, #figures b, .empty')]
-  .map(one => one.label ?? one.innerText).concat(document.querySelector('#pick').placeholder,
-    [...document.querySelectorAll('select')].map(one => one.options[0]?.text ?? ''))"""
-"""In the page: the texts of labels, which are no names of joints or files."""
 BUNDLE = files("dxlrun_view").joinpath("page", "build", "page.js")
 pytestmark = [
     pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed; apt install chromium"),
@@ -267,22 +262,6 @@ def test_page_of_a_log_waits_for_no_robot(recorded: RecordedRobot, serve: Serve,
     browser.until("document.querySelector('#no-scene')?.textContent === 'Waiting for the robot …'")
 
 
-def test_labels_are_in_sentence_case(recorded: RecordedRobot, serve: Serve, browser: Browser) -> None:
-    robot = Scripted()
-    for source in (robot, recorded):
-        browser.open(serve(source, control=source is robot).address)
-        browser.until("window.looked > 3")
-        if source is robot:
-            robot.begin(position=(0.0, 0.0))
-            await_phase(browser, "live")
-        for tab in ("joints", "controllers", "events"):
-            browser.click(f"[data-tab={tab}]")
-            labels = [label for label in browser.value(LABELS) if label[:1].isalpha()]
-            assert len(labels) > 10
-            # A tag of a joint has the word of its state, and CSS makes its first letter a capital.
-            assert [label for label in labels if not label[0].isupper() and label != "unknown"] == []
-
-
 @pytest.mark.parametrize("window", [(1440, 900, False), (1024, 700, False), (390, 844, True)])
 def test_all_of_the_page_fits_the_window(
     recorded: RecordedRobot, serve: Serve, browser: Browser, window: tuple[int, int, bool]
@@ -298,12 +277,6 @@ def test_all_of_the_page_fits_the_window(
     ground = browser.value("getComputedStyle(document.documentElement).backgroundColor")
     assert (sum(map(int, ground[4:-1].split(","))) < 384) is dark
     assert errors(browser) == []
-
-
-def test_a_page_without_the_token_says_so(recorded: RecordedRobot, serve: Serve, browser: Browser) -> None:
-    served = serve(recorded)
-    browser.open(served.address.partition("?")[0])
-    browser.until("document.querySelector('#banner')?.textContent.includes('token')")
 
 
 def test_a_page_whose_server_ended_says_so(log: Path, serve: Serve, browser: Browser) -> None:

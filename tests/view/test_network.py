@@ -5,7 +5,6 @@ from __future__ import annotations
 import ssl
 from collections.abc import Callable
 from http.client import HTTPException
-from ipaddress import IPv4Address
 from pathlib import Path
 
 import pytest
@@ -13,7 +12,6 @@ from tests.view.served import Served
 
 from dxlrun import InputError
 from dxlrun.remote.network.certificates import client_context, keys_place, server_context
-from dxlrun.remote.network.listener import ListenAddress
 from dxlrun.remote.requests.request_table import Role
 from dxlrun_view.page_server import HEADER
 from dxlrun_view.recorded_robot import RecordedRobot
@@ -82,20 +80,3 @@ def test_no_byte_of_the_page_without_a_certificate_that_counts(
 def test_a_robot_without_a_certificate_is_not_served(browse: Browse) -> None:
     with pytest.raises(InputError, match="make it by `dxlrun keys robot arm`"):
         server_context("arm")
-
-
-@pytest.mark.parametrize(
-    ("address", "expected"),
-    [
-        ("127.0.0.1", True),
-        ("127.0.0.2", True),
-        ("::1", True),
-        ("localhost", True),
-        (str(IPv4Address(0)), False),
-        ("::", False),
-        ("192.168.1.5", False),
-        ("lab3", False),
-    ],
-)
-def test_only_loopback_needs_no_certificate(address: str, expected: bool) -> None:
-    assert ListenAddress(address).is_loopback is expected

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -15,14 +14,12 @@ from msgspec import structs
 from tests.kit.changed_logs import Change, add, flip, messages, plan, put
 from tests.kit.stories import differing
 
-import dxlrun_lab.commands.replay
 from dxlrun.channels.commands import CommandMessage, encode_command
 from dxlrun.channels.tagged import decode
 from dxlrun.control.controllers.plugin_loading import load_plugins
 from dxlrun.description.motion import read_motion
 from dxlrun.errors import ControllerFault, InputError
 from dxlrun.log.log_reader import read_log
-from dxlrun.output.terminal import show_parts
 from dxlrun.remote.motion_requests import RunSnapshot, schedule_motion
 from dxlrun.remote.preparation import Preparation
 from dxlrun.testing import VirtualRobot, simulated_robot
@@ -277,16 +274,6 @@ def test_messages_that_the_recorder_lost_are_a_remark(run: Callable[..., Path]) 
     report = replay_log(run(before))
     assert report.same
     assert "the log lacks 4 messages of topics" in report.remarks
-
-
-def test_what_is_shown_of_a_message_is_one_sentence(
-    pair_log: Path, changed: Changed, capsys: pytest.CaptureFixture[str]
-) -> None:
-    report, _ = differing(changed(pair_log, flip_message(30, -1, 7)))
-    show_parts(*dxlrun_lab.commands.replay._replayed(report))
-    value = struct.unpack("<d", read_log(pair_log).topics[STATE].data[30][-8:])[0]
-    shown = f"message of {STATE}: sum[1]: recorded {-value!r}, replayed {value!r}"
-    assert capsys.readouterr().out.splitlines()[1] == f"first: cycle 29, 0.580 s, {shown}"
 
 
 # Prepared arrays: a `prepare` that makes something else of the same request is found out

@@ -134,9 +134,3 @@ def test_the_width_of_the_window_is_used(browser: Browser, width: int, columns: 
     frame = "[...Bokeh.index].find(one => one.model?.name === 'joint-0').frame.bbox.width"
     browser.until(f"{frame} > {each} - 120 && {frame} < {each}")  # the plot follows its place
     browser.until("document.documentElement.scrollWidth <= window.innerWidth")
-
-
-def test_a_link_into_the_folded_part_opens_it(browser: Browser) -> None:
-    assert browser.value("document.querySelector('#machine details').open") is False
-    browser.value("document.querySelector('#machine summary').click()")
-    assert browser.value("document.querySelector('#machine details').open") is True

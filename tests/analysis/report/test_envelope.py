@@ -76,16 +76,6 @@ def test_bins_of_any_number_of_slices_hold_the_extremes_of_their_samples(
             np.testing.assert_array_equal((rows.low[row, curve], rows.high[row, curve]), expected)
 
 
-def test_slices_make_the_same_bins_as_the_whole() -> None:
-    rng = np.random.default_rng(1)
-    every = [(int(rng.integers(1, 99)), float(rng.normal())) for _ in range(500)]
-    whole, _, _ = laid([every], 40, 7)
-    sliced, _, _ = laid([every[start : start + 13] for start in range(0, 500, 13)], 40, 7)
-    np.testing.assert_array_equal(whole.t_ns, sliced.t_ns)
-    np.testing.assert_array_equal(whole.low, sliced.low)
-    np.testing.assert_array_equal(whole.high, sliced.high)
-
-
 def test_bins_of_one_period_hold_one_sample_each() -> None:
     envelope = Envelope(1, 100, 20)
     times = np.arange(100, dtype=np.int64) * 20 + 10**12

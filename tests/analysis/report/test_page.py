@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import re
-import subprocess
-import sys
 from collections.abc import Callable
 from html.parser import HTMLParser
 from pathlib import Path
@@ -14,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.kit.awaited import DEADLINE_S
 from tests.kit.made_logs import Cycle, Said, Wire, made_log
 
 from dxlrun.channels.event_records import EventCode, Severity
@@ -227,24 +223,3 @@ def test_a_log_of_nothing_but_nan_and_one_that_is_cut_give_a_page(
     cut.write_bytes(data[: len(data) * 2 // 3])
     _, reader = made(cut)
     assert any("ends early" in text or "cannot be read" in text for text in reader.words("p"))
-
-
-def test_no_display_is_needed_and_nothing_is_warned_of(run: Path) -> None:
-    code = (
-        "import sys; from dxlrun_analysis.page.report_page import analyzed_page;"
-        "from dxlrun.log.log_reader import read_log; log = read_log(sys.argv[1]);"
-        "print(len(analyzed_page(log)[1])); assert 'matplotlib' not in sys.modules"
-    )
-    environment = {
-        key: value for key, value in os.environ.items() if key not in {"DISPLAY", "WAYLAND_DISPLAY"}
-    }
-    ran = subprocess.run(
-        [sys.executable, "-W", "error", "-c", code, str(run)],
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=DEADLINE_S,
-    )
-    assert (ran.returncode, ran.stderr) == (0, "")
-    assert int(ran.stdout) > 100_000

@@ -142,13 +142,6 @@ def test_the_machine_is_drawn_as_it_was_sampled() -> None:
     assert names == [f"machine-{kind}" for kind in ("waiting", "busy", "interrupts", "steal", "frequency")]
 
 
-def test_a_log_without_samples_has_no_plots_of_the_machine() -> None:
-    empty = Samples()
-    empty.topics = ()
-    curves, cores = collected(empty)
-    assert machine_plots(Canvas(0, 0, 1), curves, cores) == []
-
-
 @pytest.mark.parametrize("slices", [1, 4])
 def test_the_error_is_that_against_the_goal_of_the_cycle_before(
     write: Make, slices: int, monkeypatch: pytest.MonkeyPatch
