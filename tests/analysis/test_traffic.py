@@ -95,6 +95,7 @@ def test_traffic_is_that_of_the_ledger(name: str, tmp_path: Path) -> None:
     traffic = Traffic()
     traffic.add_slice(read_log(tmp_path / "run.mcap"))
     servos, buses = traffic.summarize_traffic()
+    assert buses
     for bus in buses:
         mine = [entry for entry in robot.ledger.entries if entry.bus == bus.name]
         asked = [entry.data for entry in mine if entry.direction == "in"]
