@@ -33,24 +33,6 @@ def test_version_is_that_of_the_package(
     assert said.out.endswith(", but the compiled kernel is missing; install dxlrun again\n")
 
 
-def test_help_names_every_command_and_option(dxlrun: Dxlrun) -> None:
-    said = dxlrun("--help")
-    assert said.code == 0
-    usage = "Usage: dxlrun ROBOT.yaml [ARG:=VALUE ...] [OPTIONS]\n       dxlrun COMMAND ...\n"
-    assert said.out.startswith(usage)
-    for word in [
-        "check",
-        "analyze",
-        "--play",
-        "--duration",
-        "--no-record",
-        "--take-over",
-        "--virtual",
-        "--debug",
-    ]:
-        assert word in said.out
-
-
 def test_nothing_to_do_shows_ten_commands_and_is_wrong_input(dxlrun: Dxlrun) -> None:
     said = dxlrun()
     assert said.code == 2

@@ -12,13 +12,11 @@ from pathlib import Path
 
 import pytest
 from tests.kit.commands import Dxlrun
-from tests.kit.examples import as_parameters
 from tests.kit.pages import PATHS as DOCS
 
 from dxlrun.channels.event_records import event_names
 from dxlrun.cli import verb_registry
 from dxlrun.cli.examples import schema_text
-from dxlrun.compile.robot_compiler import compile_files
 from dxlrun_view import dxlrun_commands
 from dxlwire.exceptions import HELP
 
@@ -106,15 +104,6 @@ def test_commands_inside_sentences_exist_with_their_options(
             assert option in helped[command], span
 
 
-@pytest.mark.parametrize("robot", as_parameters(sorted((ROOT / "robots").glob("*.yaml"))))
-def test_every_robot_of_the_clone_is_checked_and_runs(dxlrun: Dxlrun, reader: Path, robot: Path) -> None:
-    assert dxlrun("check", robot).code == 0
-    ran = dxlrun(robot, "--virtual", "--duration", "0.1")
-    assert ran.code == 0, ran.err
-    cycles = -(-100_000_000 // compile_files(robot, {}, []).plan.loop.period_ns)  # one at 0 s
-    assert f": 0 of {cycles} periods skipped" in ran.out
-
-
 def anchors(text: str) -> set[str]:
     """Return the names by which the headings of a page are linked to, as GitHub makes them."""
     headings = re.findall(
@@ -170,23 +159,6 @@ def test_what_the_code_cites_is_in_the_repository() -> None:
         assert any(heading.startswith(section.lower()) for heading in headings), section
 
 
-def defined(path: Path) -> set[str]:
-    """Return the names that a file defines; a method as `Class.method`, in C every word."""
-    if path.suffix != ".py":
-        return set(re.findall(r"\w+", path.read_text()))
-    names: set[str] = set()
-    functions = ast.FunctionDef | ast.AsyncFunctionDef
-    for node in ast.parse(path.read_text()).body:
-        names |= {
-            name.id for name in ast.walk(node) if isinstance(name, ast.Name) and not hasattr(node, "name")
-        }
-        if isinstance(node, functions | ast.ClassDef):
-            names.add(node.name)
-        if isinstance(node, ast.ClassDef):
-            names |= {f"{node.name}.{one.name}" for one in node.body if isinstance(one, functions)}
-    return names
-
-
 @pytest.mark.parametrize("page", PAGES)
 def test_the_names_that_a_page_gives_with_their_file_exist(page: str) -> None:
     found = re.findall(r"`([\w/.-]+\.(?:py|c))::([\w.]+)`", PAGES[page])
@@ -194,14 +166,9 @@ def test_the_names_that_a_page_gives_with_their_file_exist(page: str) -> None:
     for file, name in found:
         paths = [root / file for root in ROOTS if (root / file).exists()]
         assert paths, file
-        assert name in defined(paths[0]), f"{file}::{name}"
-
-
-def test_a_name_that_a_file_lacks_is_noticed(tmp_path: Path) -> None:
-    path = tmp_path / "line.py"
-    methods = "    def send(self):\n        width = LIMIT\n\n    async def ask(self): ...\n"
-    path.write_text(f"LIMIT = 3\n\n\nclass Line:\n{methods}")
-    assert defined(path) == {"LIMIT", "Line", "Line.send", "Line.ask"}
+        text = paths[0].read_text()
+        for word in name.split("."):  # a method is `Class.method`
+            assert re.search(rf"(?:def|class) {word}\b|^{word}\b|^\w.*\b{word}\(", text, re.MULTILINE), name
 
 
 def test_architecture_md_has_every_room() -> None:

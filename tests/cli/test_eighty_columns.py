@@ -12,21 +12,14 @@ import pytest
 from tests.kit.commands import Dxlrun
 from tests.kit.examples import as_parameters
 
-from dxlrun.channels.cycle import CycleRecord
-from dxlrun.cli.steering import steer, watch
-from dxlrun.control.controllers.plugin_loading import load_plugins
 from dxlrun.output import terminal
 from dxlrun.output.text_table import Column, Table
-from dxlrun.remote.named.named_joints import states_of
-from dxlrun.remote.preparation import Preparation
 from dxlrun.run import run_summary
-from dxlrun.testing import plan_of, simulated_robot
+from dxlrun.testing import simulated_robot
 
 pytestmark = pytest.mark.long
 
 ROBOTS = sorted((Path(__file__).parents[2] / "robots").glob("*.yaml"))
-LISTED = ["name", "type", "active", "joints", "command", "into"]
-SOURCES = ["name", "kind", "states", "commands", "ranges"]
 
 
 def texts(lines: Iterable[terminal.Line]) -> list[str]:
@@ -72,32 +65,6 @@ MODELS = ("AX-12A", "MX-106", "XM430-W350", "PH54-200-S500-R", "OpenCR")
 )
 def test_list(dxlrun: Dxlrun, seen: list[Table], words: str) -> None:
     assert dxlrun(*words.split()).code == 0
-
-
-@pytest.mark.parametrize("robot", as_parameters(ROBOTS))
-def test_robot_that_runs(seen: list[Table], robot: Path) -> None:
-    plan = plan_of(robot)
-    loop = plan.loop
-    preparation = Preparation({joint.name: joint for joint in loop.joints}, load_plugins())
-    listed = [
-        {name: getattr(one, name) for name in LISTED}
-        | {"held": False, "rate": 50.0, "takes": preparation.takes(one)}
-        for one in loop.controllers
-    ]
-    sources = [{name: getattr(one, name) for name in SOURCES} for one in loop.sources]
-    record = CycleRecord(loop.layout)
-    states = record.states
-    for values in (states.motion, record.goals.values, states.temperature, states.voltage):
-        values[:] = -123.4
-    states.torque[:], states.hardware_error[:], states.valid[:] = 4, 0x24, True
-    record.sources.values[:], record.sources.age_ns[:] = -1.2345, 123_400_000
-    record.controller_ns[:] = 100_000
-    places = {one.name: place for place, one in enumerate(loop.controllers)}
-    info = {"controllers": listed}
-    watched: Any = SimpleNamespace(info=info, states=states_of(plan, record, places))
-    terminal.show_parts(steer.controllers(info), steer.sources({"sources": sources}))
-    terminal.show_parts(steer.groups({"groups": plan.groups}))
-    terminal.show_parts(watch.joints(watched), watch.sources(watched), watch.controllers(watched))
 
 
 @pytest.mark.needs("logs")

@@ -189,16 +189,3 @@ def test_what_was_measured_is_kept(tmp_path: Path, kill: bool) -> None:
     (topic,) = read_log(tmp_path / "kept.mcap").topics.values()
     assert len(topic.data) == one["wake_ups"]
     assert errors == ""
-
-
-def test_interrupted_measurement_is_reported_below_its_table(
-    dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def interrupted(*_: object) -> bool:
-        monkeypatch.undo()
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(latency_measurement._Process, "_ended", interrupted)
-    found = dxlrun("latency", "--count", 600_000, "--no-record")
-    assert found.code == 130
-    assert found.errors[-1].startswith("interrupted")

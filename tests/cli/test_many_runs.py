@@ -1,13 +1,11 @@
-"""The programs of docs/how-to/many-runs.md."""
+"""The program of docs/how-to/many-runs.md."""
 
 from __future__ import annotations
 
 import re
 import subprocess
 import sys
-from collections.abc import Callable, Iterable
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
@@ -18,7 +16,7 @@ from dxlrun.testing import read_log, simulated_robot
 
 ROOT = Path(__file__).parents[2]
 ROBOT, MOTION = ROOT / "robots/effort_arm.yaml", ROOT / "robots/motions/effort_arm_lift.yaml"
-PROGRAM, ON_SEVERAL_COMPUTERS = re.findall(r"```python\n(.*?)```", page_text("many-runs.md"), re.DOTALL)
+PROGRAM, _ = re.findall(r"```python\n(.*?)```", page_text("many-runs.md"), re.DOTALL)
 SMALL = 'GRID = {"p": (2, 10, "high"), "d": (0.05,)}'
 
 
@@ -55,27 +53,3 @@ def shoulder_error_deg(tmp_path: Path, p: str) -> float:
     reference, position = cycles["reference"][:, 0], cycles["position"][:, 0]
     known = np.isfinite(reference)
     return float(np.degrees(np.sqrt(np.mean((reference - position)[known] ** 2))))
-
-
-def test_program_is_short() -> None:
-    assert len(PROGRAM.splitlines()) <= 45
-
-
-def test_lines_for_several_computers_map_the_score_over_the_grid(monkeypatch: pytest.MonkeyPatch) -> None:
-    class Client:
-        def __init__(self, address: str) -> None:
-            assert address == "tcp://lab1:8786"
-
-        def map(self, function: Callable[[int], int], values: Iterable[int]) -> list[int]:
-            return list(map(function, values))
-
-        def gather(self, futures: list[int]) -> list[int]:
-            return futures
-
-    module = ModuleType("dask.distributed")
-    monkeypatch.setattr(module, "Client", Client, raising=False)
-    monkeypatch.setitem(sys.modules, "dask", ModuleType("dask"))
-    monkeypatch.setitem(sys.modules, "dask.distributed", module)
-    names = {"score": lambda value: value * 2, "grid": [1, 2, 3]}
-    exec(ON_SEVERAL_COMPUTERS, names)  # noqa: S102  (it is our page)
-    assert names["scores"] == [2, 4, 6]

@@ -133,27 +133,6 @@ def test_the_list_has_every_controller_and_what_it_takes(dxlrun, torso: RemoteRo
         assert found, before
 
 
-def test_the_list_as_json_is_what_the_robot_returns(dxlrun, torso: RemoteRobot) -> None:
-    (printed,) = result_of(dxlrun("list", "--json", "--robot", "bioloid_torso").out)
-    assert (printed["name"], printed["robot"], printed["rate"]) == ("bioloid_torso", "bioloid_torso", 50.0)
-    assert [one["name"] for one in printed["controllers"]] == list(controllers(torso))
-
-
-def test_the_list_draws_the_controllers_with_those_that_are_inactive(dxlrun, torso: RemoteRobot) -> None:
-    said = dxlrun("list", "--graph")
-    assert (said.code, said.err) == (0, "")
-    assert "whole_body_position (inactive)" in said.out
-    assert re.search(r"│ left_arm +│", said.out)
-
-
-def test_list_draws_the_controllers_into_a_file(dxlrun, torso: RemoteRobot, tmp_path: Path) -> None:
-    file = tmp_path / "torso.svg"
-    said = dxlrun("list", "--graph", str(file))
-    assert (said.code, said.out.splitlines()[1]) == (0, f"the controller graph is in {file}")
-    assert "whole_body_position" in file.read_text()
-    assert dxlrun("list", "--graph", "torso.png").code == 2
-
-
 def test_a_robot_that_has_ended_is_an_error(
     dxlrun, torso: RemoteRobot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -173,32 +152,6 @@ def test_what_is_typed_is_answered(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     play(case, dxlrun, commands.Stage())
-
-
-def test_commands_leave_joints_and_registers_as_they_say(dxlrun, torso: RemoteRobot) -> None:
-    last = torso.events()["last"]
-    assert dxlrun("set", "head_yaw_joint", "ccw_compliance_slope", "128", "--debug").code == 0
-    printed = [event["text"] for event in torso.events(last)["events"] if event["name"] == "register_written"]
-    assert printed[-1].startswith("CCW Compliance Slope (29) was changed from ")
-    found = result_of(dxlrun("get", "head_yaw_joint", "return_delay_time", "--json").out)
-    assert (found["title"], found["area"]) == ("Return Delay Time (5)", "EEPROM")
-    assert torso.set_parameters("left_arm", {"speed": 2}) == {"speed": (1.0, 2.0)}
-    assert torso.parameters("left_arm")["speed"] == 2.0
-    torso.set_parameters("left_arm", {"speed": 1})
-    assert dxlrun("torque", "off", "head_yaw_joint", "--release").code == 0
-    assert [torso.get(joint)["torque"] for joint in ("head_yaw_joint", "head_pitch_joint")] == ["limp", "on"]
-    assert re.search(r"torque +limp", dxlrun("get", "head_yaw_joint").out)
-    assert not controllers(torso)["head"]["active"]
-    assert torso.torque("head", on=True).offered == ("head",)
-    said = dxlrun("torque", "off", "left_arm", "--release", "--json")
-    assert result_of(said.out)["deactivated"] == ["left_arm"]
-    assert "left_arm" in torso.torque("left_arm", on=True).offered
-    printed = result_of(dxlrun("halt", "--json").out)
-    assert set(printed) == {"robot", "cycle", "seconds", "joint", "velocity"}
-    assert [name for name, one in controllers(torso).items() if one["active"]] == ["joint_state_broadcaster"]
-    assert torso.switch(["head"]).cycle > printed["cycle"]
-    assert dxlrun("rate", "80").code == 0
-    assert torso.info()["rate"] == 80
 
 
 def test_send_moves_the_joints_that_are_named_with_units(dxlrun, torso: RemoteRobot) -> None:
@@ -270,25 +223,6 @@ def test_a_motion_is_played_into_a_robot_that_runs(dxlrun, torso: RemoteRobot, t
         2,
         [f"{file}:3:17: controller head is not active; activate it by `dxlrun switch --activate head`"],
     )
-
-
-def test_a_snapshot_of_the_robot(dxlrun, torso: RemoteRobot) -> None:
-    said = dxlrun("watch", "--once")
-    assert (said.code, said.err) == (0, "")
-    assert "left_elbow_joint" in said.out
-    assert "whole_body_posvel" in said.out
-    line = result_of(dxlrun("watch", "--json", "--once").out)
-    assert line["torque"][line["joints"].index("left_elbow_joint")] == "on"
-
-
-def test_send_takes_a_file(dxlrun, torso: RemoteRobot, tmp_path: Path) -> None:
-    file = tmp_path / "wave.yaml"
-    file.write_text("points:\n  - {time: 200 ms, positions: [0.1 rad, 0 deg, 10 deg]}\n")
-    said = dxlrun("send", "left_arm", "trajectory", "--file", file, "--json")
-    done = result_of(said.out)
-    assert (said.code, said.err, done["robot"]) == (0, "", "bioloid_torso")
-    assert done["cycle"] > 0
-    until_sent(torso, "left_elbow_joint", 0.1745)
 
 
 def test_a_command_is_one_request(dxlrun, torso: RemoteRobot, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -97,13 +97,6 @@ def test_full_disk_behind_the_output_is_one_sentence(tmp_path: Path, torso: Path
     assert said.stderr.splitlines()[-1] == "dxlrun: No space left on device; run with --debug for details"
 
 
-@pytest.mark.parametrize("words", ["check {torso}", "check {torso} --json", "--help", "check missing.yaml"])
-def test_reader_that_leaves_early_gets_no_traceback(tmp_path: Path, torso: Path, words: str) -> None:
-    said = shell(f"dxlrun {words} 2>&1 | head -n 1", tmp_path, torso=torso)
-    assert said.stderr == ""
-    assert "Traceback" not in said.stdout
-
-
 def test_terminal_that_knows_ascii_alone_gets_tables_and_graphs_in_it(tmp_path: Path, torso: Path) -> None:
     line = "export PYTHONIOENCODING=ascii; dxlrun check {torso} --graph && dxlrun check {torso}"
     said = shell(line, tmp_path, torso=torso)
