@@ -44,6 +44,7 @@ MESSAGES = {
     "started anew": r"\bstart(s|ed)? anew\b",
     "is none of": r"\bis none of\b",
     "what stands": r"\bwhat stands\b",
+    "limp": r"\bjoints? without torque\b|\b(has|have|holds) no torque\b(?! (limit|or current mode))",
 }
 """Phrases that messages avoid as well."""
 UNCHANGED = {
