@@ -2,19 +2,8 @@ import math
 import re
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from dxlrun.compile.motion_samples import LONGEST_FORMULA, Expression
-
-
-@settings(max_examples=50, deadline=None)
-@given(t=st.floats(0, 100))
-def test_the_formulas_of_the_thesis_have_the_values_of_python(t: float):
-    left = Expression("0.2 * (sin(2 * t) - sin(4 * t)) - 0.4")
-    right = Expression("0.2 * (sin(2*t) - cos(1.5*t)) - 0.4")
-    assert left.at(t) == pytest.approx(0.2 * (math.sin(2 * t) - math.sin(4 * t)) - 0.4, abs=1e-12)
-    assert right.at(t) == pytest.approx(0.2 * (math.sin(2 * t) - math.cos(1.5 * t)) - 0.4, abs=1e-12)
 
 
 @pytest.mark.parametrize(

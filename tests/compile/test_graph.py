@@ -48,10 +48,3 @@ def test_controller_that_reads_itself_is_warned_about_and_can_be_ordered() -> No
         "low reads low/j/position, its own reference",
         "filter reads filter/x, its own state of the previous cycle",
     ]
-
-
-def test_mistake_has_its_path_in_the_file() -> None:
-    plan = ControllerPlan("up", "part", "", "{}", ("j",), ("position",), (), True, 1, into=("low",))
-    (mistake,) = ControllerGraph(("j",), (plan,)).find_mistakes()
-    assert mistake.at == ("controllers", "up", "into", 0)
-    assert mistake.what == "`into` of up names an unknown controller low"

@@ -12,7 +12,6 @@ from dxlrun.cli import check
 from dxlrun.compile.robot_compiler import compile_files
 from dxlrun.output.text_table import Table
 from dxlrun.plan.loop_plan import JOINT_PROPERTIES, JointProperty, JointValues
-from dxlrun.remote.requests.replies import RobotInfo
 
 ROBOT = Path(__file__).parents[2] / "robots" / "mechanics.yaml"
 
@@ -50,9 +49,3 @@ def test_running_robot_lists_the_same_properties() -> None:
     assert found["units"].keys() == found["speeds"].keys() == {joint.name for joint in joints}
     assert [name for name, unit in found["units"].items() if unit == "m"] == ["gripper"]
     assert found["limits"].keys() == {joint.name for joint in joints if joint.bounded}
-
-
-def test_order_of_a_robots_description_is_that_of_its_documentation() -> None:
-    names = "robot rate paused began cycles skipped joints groups units effort_units limits speeds joint_keys"
-    fields = [one.name for one in dataclasses.fields(RobotInfo)]
-    assert " ".join(fields) == f"{names} controllers sources file log servos"

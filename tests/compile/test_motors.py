@@ -5,12 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from tests.kit.answers import result_of
-from tests.kit.robot_cases import compile_cases
 from tests.kit.robots import compile_text, robot_text
 
 from dxlrun import MotorModel, Stribeck
-from dxlrun.cli.app import run_tokens
 from dxlrun.control.controllers.plugin_loading import load_plugins
 from dxlrun.description.joints.motor_file import motor_text, read_motor
 from dxlrun.errors import InputError
@@ -74,11 +71,6 @@ def test_file_is_looked_for_beside_the_file_that_names_it(motor: MotorModel) -> 
     assert sorted(plan.included) == ["arms/joints.yaml", "arms/shoulder.yaml"]
 
 
-def test_directory_is_no_motor_file(here: None) -> None:
-    MOTOR_FILE.mkdir()
-    assert [each.what for each in compile_cases(ROBOT)[1]] == ["this is a directory"]
-
-
 def test_written_motor_is_in_the_plan_as_text(motor: MotorModel) -> None:
     text = MOTOR_FILE.write_text(motor_text(motor, {})) and MOTOR_FILE.read_text()
     plan = compile_text(ROBOT).plan
@@ -97,15 +89,3 @@ def test_controller_of_a_running_robot_or_a_replay_needs_motors_too(motor: Motor
     assert with_settings(loop, [Setting("law", ("scale",), 0.5)], plugins) != loop
     with pytest.raises(InputError, match="--set law: law needs the motor of elbow"):
         with_settings(loop, [Setting("law", ("joints",), ["elbow"])], plugins)
-
-
-def test_check_shows_which_joints_have_a_motor_file(
-    motor: MotorModel, capsys: pytest.CaptureFixture[str]
-) -> None:
-    Path("robot.yaml").write_text(ROBOT)
-    assert run_tokens(["check", "robot.yaml"]) == 0
-    rows = {line.split()[0]: line.split()[-1] for line in capsys.readouterr().out.splitlines() if line}
-    assert (rows["joint"], rows["shoulder"], rows["elbow"]) == ("file", "shoulder.yaml", "none")
-    assert run_tokens(["check", "robot.yaml", "--json"]) == 0
-    joints = result_of(capsys.readouterr().out)["joints"]
-    assert [joint["motor"] for joint in joints] == ["shoulder.yaml", None]

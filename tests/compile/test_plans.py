@@ -204,8 +204,3 @@ def test_character_that_is_not_allowed_in_a_urdf_is_refused_at_its_place() -> No
     Path("pair.urdf").write_text("<robot>\x01</robot>")
     (error,) = [one for one in problems_in(f"{PAIR}model: {{urdf: pair.urdf}}\n") if one.severity == "error"]
     assert str(error).endswith("pair.urdf:1:8: the character U+0001 is not allowed in URDF; remove it")
-
-
-def test_frame_of_odometry_is_none_of_a_sensor() -> None:
-    robots = HUMANOID.parent
-    assert problems_in((robots / "diff_drive.yaml").read_text().replace("urdf/", f"{robots}/urdf/")) == ()

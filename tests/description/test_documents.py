@@ -14,7 +14,6 @@ from dxlrun.cli.examples import schema_text
 from dxlrun.description.base_form import Form
 from dxlrun.description.document import Marks
 from dxlrun.description.joints.motor_file import read_motor
-from dxlrun.description.motion import Formula, Target
 from dxlrun.description.robot import robot_form
 from dxlrun.errors import Mark
 
@@ -89,10 +88,6 @@ def test_a_default_of_the_schema_is_that_of_the_program(part: str, key: str) -> 
     given = robot.replace(*written[part])
     assert given != robot
     assert desk.robot(given).robot == desk.robot(robot).robot
-
-
-def test_targets_and_formulas_have_the_same_three_quantities() -> None:
-    assert set(Target.model_fields) == set(Formula.model_fields) == {"position", "velocity", "acceleration"}
 
 
 def test_marks_are_those_of_the_nearest_parent_that_is_in_the_file() -> None:

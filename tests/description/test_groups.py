@@ -10,7 +10,6 @@ from tests.kit.robots import robot_text
 
 from dxlrun.description.joints.groups import NAMING, without_groups
 from dxlrun.description.motion import parse_motion
-from dxlrun.description.reading import read_robot
 from dxlrun.errors import Mark
 
 ROBOT = robot_text("shared")
@@ -108,12 +107,3 @@ def test_fragments_share_groups() -> None:
     assert robot.groups["left"].joints == ("elbow",)
     assert {joint.model for joint in robot.joints.values()} == {"XL430-W250"}
     assert robot.controllers["all_joints"].parameters == {"joints": ["knee", "elbow"]}
-
-
-def test_wolfgangs_servos_have_their_registers() -> None:
-    robot = read_robot(Path(__file__).parents[2] / "robots/wolfgang.yaml", {}).robot
-    gains = {joint.registers["position_p_gain"] for joint in robot.joints.values()}
-    assert {len(joint.registers) for joint in robot.joints.values()} == {12}
-    assert (gains, robot.joints["RKnee"].registers["position_p_gain"]) == ({500, 800, 1200, 4000}, 4000)
-    assert robot.joints["LKnee"].bus == "left_leg"
-    assert (robot.joints["LKnee"].model, robot.joints["LHipYaw"].model) == ("XH540-W270", "MX-106")

@@ -3,7 +3,6 @@ from __future__ import annotations
 import math
 
 import pytest
-from pydantic import ValidationError
 from tests.kit import desk
 from tests.kit.desk import TORSO
 
@@ -50,14 +49,6 @@ def test_a_robot_needs_buses_and_joints() -> None:
         "robot.yaml:3:8: buses has too few entries; write at least 1",
         "robot.yaml:4:9: joints has too few entries; write at least 1",
     ]
-
-
-def test_a_description_cannot_be_changed() -> None:
-    description = desk.robot(TORSO)
-    with pytest.raises(ValidationError, match="frozen"):
-        description.robot.loop.rate = 1.0
-    with pytest.raises(AttributeError):
-        description.text = ""
 
 
 def test_the_text_and_the_places_are_kept() -> None:
