@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import re
-import shlex
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-from tests.kit.pages import page_text
 
 from dxlrun.errors import Refused
 from dxlrun_lab.guided.choice import situation_of
@@ -71,13 +68,3 @@ def perform(
     assert done.not_restored == ()
     assert state_of(rig) == before
     return plays, done
-
-
-def commands_of(page: str, verb: str, section: str = "") -> list[list[str]]:
-    """Return the words of the commands of a page in docs, or of a section of it."""
-    text = page_text(page)
-    if section:
-        text = text.partition(section)[2].partition("\n## ")[0]
-    found = re.findall(rf"^    dxlrun ({verb} .*)$", text, re.MULTILINE)
-    assert found
-    return [shlex.split(line) for line in found]

@@ -16,9 +16,12 @@ def page_text(name: str) -> str:
     return PATHS[name].read_text()
 
 
-def page_commands(name: str) -> list[list[str]]:
-    """Return the words of each command that a page shows in a line of its own, without `dxlrun`."""
-    lines = re.findall(r"^    dxlrun (.+)$", page_text(name), re.MULTILINE)
+def page_commands(name: str, section: str = "") -> list[list[str]]:
+    """Return the words of each command in a line of its own on a page, or in a section, without `dxlrun`."""
+    text = page_text(name)
+    if section:
+        text = text.partition(f"\n## {section}\n")[2].partition("\n## ")[0]
+    lines = re.findall(r"^    dxlrun (.+)$", text, re.MULTILINE)
     return [shlex.split(line.partition("  #")[0]) for line in lines]
 
 

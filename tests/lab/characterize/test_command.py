@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 from tests.kit.answers import result_of
-from tests.kit.experiments import commands_of
-from tests.kit.pages import page_text
+from tests.kit.pages import page_commands, page_text
 
 from dxlrun_lab.characterize import procedure
 
@@ -30,7 +29,7 @@ def slow_bus(tmp_path: Path) -> Path:
 
 @pytest.mark.needs("report")
 def test_the_commands_of_the_page_measure(dxlrun, tmp_path):
-    virtual, real, running = commands_of("experiments.md", "characterize", "\n## characterize")
+    virtual, real, running = page_commands("experiments.md", "characterize")
     done = dxlrun(*virtual)
     assert (done.code, "smallest change that moves it" in done.out) == (0, True), done.err
     page = (tmp_path / "dead_band.html").read_text()

@@ -8,14 +8,15 @@ from pathlib import Path
 import pytest
 from tests.kit.answers import result_of
 from tests.kit.campaigns import campaign
-from tests.kit.experiments import ROBOTS, commands_of
+from tests.kit.experiments import ROBOTS
+from tests.kit.pages import page_commands
 
 from dxlrun.description.joints.motor_file import read_motor
 
 pytestmark = pytest.mark.long
 
 ROBOT = ROBOTS / "single_joint.yaml"
-OF_THE_PAGE = commands_of("experiments.md", "identify", "## Identify\n")
+OF_THE_PAGE = page_commands("experiments.md", "Identify")
 
 
 @pytest.mark.parametrize(("number", "sentence"), [(1, "0.5 s are too short"), (2, "not found; a run prints")])

@@ -14,7 +14,8 @@ from xml.etree import ElementTree as ET
 import pytest
 from msgspec.structs import replace
 from tests.kit.answers import result_of
-from tests.kit.experiments import ROBOTS, commands_of
+from tests.kit.experiments import ROBOTS
+from tests.kit.pages import page_commands
 
 from dxlrun.control import realtime_grants
 from dxlrun.output.terminal import fitted
@@ -139,7 +140,9 @@ def test_every_setup_has_its_schedule_and_scheduler(dxlrun, runs, pretend):
 def test_the_commands_of_the_pages_are_understood(dxlrun, runs, pretend, monkeypatch, page):
     monkeypatch.setattr("dxlrun_lab.stress.Stress", lambda *, wanted: Stress(wanted=False))
     monkeypatch.setattr("dxlrun_lab.tracking.tracking_report.page", lambda result: "a page")
-    for words in commands_of(page, "experiment tracking"):
+    lines = page_commands(page, "Tracking")
+    assert lines
+    for words in lines:
         named = words[words.index("--setups") + 1].split(",") if "--setups" in words else ()
         plans = pretend(*all_ended(runs, named))
         assert dxlrun(*words).code == 0
