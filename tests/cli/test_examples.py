@@ -77,18 +77,6 @@ def test_copy_goes_into_robots_and_may_be_made_again(
     assert all(Path(file).is_file() for file in shown["files"])
 
 
-def test_what_was_changed_is_not_overwritten(dxlrun: Dxlrun, tmp_path: Path) -> None:
-    mine = tmp_path / "bioloid_torso.yaml"
-    mine.write_text("name: mine\n")
-    said = dxlrun("examples", "bioloid_torso", tmp_path)
-    sentence = f"dxlrun: {mine} already exists with other contents; choose another directory"
-    assert (said.code, said.errors) == (2, [sentence])
-    assert [*tmp_path.iterdir()] == [mine]
-    assert mine.read_text() == "name: mine\n"
-    said = dxlrun("examples", "diff_drive", mine / "x")
-    assert (said.code, len(said.errors), "is not a directory)" in said.err) == (2, 1, True)
-
-
 def test_installed_package_takes_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     package = tmp_path / "site-packages" / "dxlrun"
     monkeypatch.setattr(inputs, "__file__", str(package / "cli" / "inputs.py"))

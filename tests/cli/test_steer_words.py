@@ -7,8 +7,6 @@ from pathlib import Path
 
 import pytest
 from rich.console import Console
-from tests.kit.answers import result_of
-from tests.kit.commands import Dxlrun
 
 from dxlrun.cli.steering.steer import command, controllers, headline, state
 from dxlrun.cli.steering.written import WrittenEntry
@@ -20,23 +18,6 @@ WRONG = {
     "problems": ["positions[0]: no unit; add it", "v: no; b"],
 }
 REFUSED = Refused("...", code="wrong_quantity", fields=WRONG, wrong_input=True)
-
-
-def test_list_of_no_robots_is_not_a_failure(dxlrun: Dxlrun, reader: Path) -> None:
-    """Other commands are refused: refusals.txt."""
-    assert dxlrun("list") == (0, "no running robot found; start one by `dxlrun ROBOT.yaml`\n", "")
-    said = dxlrun("list", "--json")
-    assert (said.code, result_of(said.out), said.err) == (0, [], "")
-
-
-def test_wrong_file_is_refused_with_its_places(dxlrun: Dxlrun, reader: Path) -> None:
-    (reader / "look.yaml").write_text("positions: [1 deg]\npositions: [2 deg]\n")
-    said = dxlrun("send", "head", "posvel", "--file", "look.yaml")
-    sentence = "look.yaml:2:1: positions is already defined in line 1; keep one of the two"
-    assert (said.code, said.errors) == (2, [sentence])
-    said = dxlrun("load", "spare", "--file", "none.yaml")
-    sentence = "none.yaml:1:1: file not found; check the path, relative to the current directory"
-    assert (said.code, said.errors) == (2, [sentence])
 
 
 def test_wrong_quantity_is_reported_at_its_place_in_the_file(tmp_path: Path) -> None:
