@@ -17,7 +17,7 @@ from dynamixel_easy_sdk import (
     connector,
 )
 from tests.foreign.conftest import PatientPort
-from tests.kit.awaited import DEADLINE_S, until
+from tests.kit.awaited import until
 
 from dxlsim.simulation_plan import BusConfig, ServoConfig
 from dxlwire.control_table import all_tables, find_table
@@ -35,9 +35,7 @@ LINES = {
     "models": MODELS,
     "modes": ["XM430-W350"],
     "settings": ["XM430-W350"],
-    "guarded": ["XM430-W350"],
     "group": ["XM430-W350"] * 2,
-    "reset": ["XL430-W250"],
 }
 BUSES = [
     BusConfig(name, 1_000_000, tuple(ServoConfig(n, each, POSITION) for n, each in enumerate(models, 1)), 2.0)
@@ -130,33 +128,3 @@ def test_a_group_reads_and_writes_by_sync_and_by_bulk(connect: Any) -> None:
         return abs(position - 800) < 20
 
     assert until(arrived)
-
-
-def test_a_locked_eeprom_is_an_access_error(connect: Any, simulation: Any) -> None:
-    motor = connect("guarded").createMotor(1)
-    motor.enableTorque()
-    motor.torque_status = 0  # it would not even ask otherwise
-    simulation.expect_refusals("guarded", 1)
-    with pytest.raises(DxlRuntimeError) as refused:
-        motor.setHomingOffset(1)
-    assert refused.value.dxl_error == DxlError.SDK_ERRNUM_ACCESS
-
-
-def test_a_factory_reset_but_for_id_and_rate_leaves_the_servo_there(connect: Any, simulation: Any) -> None:
-    simulation.expect_haste("reset")
-    bus = connect("reset")
-    motor = bus.createMotor(1)
-    motor.changeID(9)
-    motor.setMinPositionLimit(500)
-    motor.factoryResetExceptIDAndBaudRate()
-    bus._port_handler.patience_ms = 30.0
-
-    def answers() -> bool:
-        try:
-            return bool(motor.ping() == 1060)
-        except DxlRuntimeError:
-            return False
-
-    assert until(answers)
-    bus._port_handler.patience_ms = DEADLINE_S * 1000
-    assert motor.getMinPositionLimit() == 0

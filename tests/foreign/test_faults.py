@@ -13,9 +13,9 @@ from dxlsim.simulation_plan import BusConfig, ServoConfig
 
 PROTOCOL = 2.0
 ALERT = 0x80
-TORQUE, HARDWARE_ERROR, SHUTDOWN = Item(64, 1), Item(70, 1), Item(63, 1)
+TORQUE, HARDWARE_ERROR = Item(64, 1), Item(70, 1)
 """Of the X series."""
-TORQUE_1, TORQUE_LIMIT_1, VOLTAGE_1, MODEL_1 = Item(24, 1), Item(34, 2), Item(42, 1), Item(0, 2)
+TORQUE_1, TORQUE_LIMIT_1 = Item(24, 1), Item(34, 2)
 """Of the AX series."""
 SPOILT = {
     "corrupt servo=1": COMM_RX_CORRUPT,
@@ -29,7 +29,7 @@ BUSES = [
     BusConfig(
         f"{name}{protocol}", 1_000_000, (ServoConfig(1, model, 2.0), ServoConfig(2, model, 2.0)), protocol
     )
-    for name in ("overload", "overheat", "voltage", "spoilt", "torn")
+    for name in ("overload", "overheat", "spoilt", "torn")
     for protocol, model in MODELS.items()
 ]
 faults = pytest.mark.parametrize(
@@ -61,24 +61,6 @@ def test_a_shutdown_of_protocol_1_takes_the_torque_limit(
     assert until(lambda: host.get(1, TORQUE_LIMIT_1) == (0, COMM_SUCCESS, bit))
     assert host.get(1, TORQUE_1) == (1, COMM_SUCCESS, bit)
     assert words in host.sdk.getRxPacketError(bit)
-
-
-def test_a_voltage_that_no_shutdown_lists_alerts_and_leaves_the_torque(connect: Any, simulation: Any) -> None:
-    host = connect("voltage2")
-    host.write(1, SHUTDOWN, 0x34)  # without the voltage's bit
-    host.write(1, TORQUE, 1)
-    simulation.fault("voltage volts=8.5 bus=voltage2")
-    assert until(lambda: host.get(1, TORQUE) == (1, COMM_SUCCESS, ALERT))
-    simulation.fault("voltage volts=12 bus=voltage2")
-    assert until(lambda: host.get(1, TORQUE)[2] == 0)
-
-
-def test_a_voltage_error_of_protocol_1_comes_with_good_data(connect: Any, simulation: Any) -> None:
-    host = connect("voltage1", 1.0)
-    simulation.fault("voltage volts=5 servo=1 bus=voltage1")
-    assert until(lambda: host.get(1, VOLTAGE_1) == (50, COMM_SUCCESS, 1))
-    assert host.get(1, MODEL_1) == (12, COMM_SUCCESS, 1)
-    assert host.read(2, MODEL_1) == 12
 
 
 def test_a_reboot_ends_a_shutdown(connect: Any, simulation: Any) -> None:

@@ -35,9 +35,8 @@ BUSES = (
         for kind in MODELS
         for use in ("read", "drive")
     ),
-    *(line(name, 2.0, "XL430-W250", "XL330-M288") for name in ("mixed", "moved")),
+    line("moved", 2.0, "XL430-W250", "XL330-M288"),
     line("many", 2.0, *["XL330-M288"] * 8),
-    line("restarted", 2.0, "XL430-W250"),
     line("stuffed", 2.0, "XL330-M288"),
 )
 every = pytest.mark.parametrize("kind", MODELS)
@@ -100,21 +99,6 @@ def test_two_servos_are_found_and_driven_by_a_sync_write(connect: Any, simulatio
     assert until(arrived)
 
 
-@pytest.mark.parametrize("kind", ["Ax", "Mx"])
-def test_nobody_answers_a_sync_read_of_protocol_1(connect: Any, simulation: Any, kind: str) -> None:
-    bus = connect(f"drive {kind}", kind)
-    bus.set_timeout(0.03)
-    simulation.expect_refusals(f"drive {kind}", 2)
-    with pytest.raises(RuntimeError, match="timed out"):
-        bus.sync_read_register([1, 2], "present_position")
-
-
-def test_angles_are_radians_around_the_middle(connect: Any) -> None:
-    servo = connect("drive Xl330", "Xl330")
-    raw = servo.read_raw_present_position(2)[0]
-    assert abs(servo.read_present_position(2)[0] - (raw - 2048) * 6.283185307 / 4096) < 1e-6
-
-
 def test_a_fast_sync_read_of_eight_servos_tells_what_a_sync_read_does(connect: Any) -> None:
     bus, ids = connect("many", "Xl330"), list(range(1, 9))
     slow = bus.sync_read_raw_data(ids, 132, 4)
@@ -130,30 +114,6 @@ def test_data_that_look_like_a_header_arrive_as_they_were_meant(connect: Any) ->
     assert servo.write_raw_data_with_error(1, 104, tricky) == 0
     data, error = servo.read_raw_data_with_error(1, 104, 8)
     assert (list(data), error) == (tricky, 0)
-
-
-def test_a_reboot_and_a_factory_reset_are_answered(connect: Any, simulation: Any) -> None:
-    simulation.expect_haste("restarted")
-    servo = connect("restarted", "Xl430")
-    servo.write_register(1, "return_delay_time", 0)
-    servo.write_register(1, "led", 1)
-    for restart, expected in ((servo.reboot, (0, 0)), (servo.factory_reset, (0, 250))):
-        restart(1)
-        servo.set_timeout(0.05)
-        assert until(lambda: bool(servo.ping(1)))
-        servo.set_timeout(DEADLINE_S)
-        assert (servo.read_register(1, "led"), servo.read_register(1, "return_delay_time")) == expected
-
-
-def test_servos_of_two_kinds_share_a_line(simulation: Any) -> None:
-    kinds = {1: rustypot.Xl430PyController.definition(), 2: rustypot.Xl330PyController.definition()}
-    with rustypot.Bus(simulation.ports["mixed"], RATE, DEADLINE_S, kinds) as bus:
-        assert all(abs(each - 1304) <= 1 for each in bus.sync_read_register([1, 2], "present_position"))
-        assert bus.set_torque([1, 2], True) == {}
-        bus.sync_write_register([1, 2], "goal_position", [1400, 1200])
-        assert bus.sync_read_register([1, 2], "goal_position") == [1400, 1200]
-        assert bus.sync_read_register_with_error([1, 2], "torque_enable") == [(1, 0), (1, 0)]
-        assert bus.set_torque([1, 2], False) == {}
 
 
 def test_a_servo_is_given_a_new_id_and_a_new_rate_and_is_found_there(simulation: Any) -> None:

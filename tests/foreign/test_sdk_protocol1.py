@@ -10,16 +10,13 @@ from typing import Any
 import pytest
 from dynamixel_sdk import COMM_RX_TIMEOUT, COMM_SUCCESS, GroupBulkRead, GroupSyncWrite
 from tests.foreign.conftest import Item
-from tests.kit.awaited import until
 
 from dxlsim.simulation_plan import BusConfig, ServoConfig
 
 PROTOCOL = 1.0
 AX12, MX28 = 12, 29
 """Model numbers (e-Manual, control tables, Model Number (0))."""
-ID, BAUD_RATE, RETURN_DELAY, CW_LIMIT, CCW_LIMIT = Item(3, 1), Item(4, 1), Item(5, 1), Item(6, 2), Item(8, 2)
-TORQUE, LED, GOAL, SPEED, PRESENT = Item(24, 1), Item(25, 1), Item(30, 2), Item(32, 2), Item(36, 2)
-PRESENT_SPEED, REGISTERED, LOCK = Item(38, 2), Item(44, 1), Item(47, 1)
+CW_LIMIT, TORQUE, LED, GOAL, PRESENT = Item(6, 2), Item(24, 1), Item(25, 1), Item(30, 2), Item(36, 2)
 NEAR = 10
 """Ticks that the examples call arrived."""
 MIDDLE = 2.617994
@@ -29,10 +26,6 @@ LINES = {
     "sync": {1: "AX-12A", 2: "AX-12A"},
     "bulk": {1: "MX-28", 2: "MX-28", 3: "AX-12A"},
     "refused": {1: "AX-12A", 2: "MX-28"},
-    "registered": {1: "AX-12A", 2: "AX-12A"},
-    "wheel": {1: "AX-12A"},
-    "renamed": {1: "AX-12A", 2: "MX-28"},
-    "reset": {7: "AX-12A", 8: "MX-28"},
 }
 BUSES = [
     BusConfig(name, 1_000_000, tuple(ServoConfig(each, model, MIDDLE) for each, model in models.items()))
@@ -106,53 +99,3 @@ def test_what_the_manual_forbids_gets_its_error_bits(connect: Any, simulation: A
     _, result, error = host.sdk.txRxPacket(host.port, [0, 0, 1, 2, 5, 0])  # action, and nothing is registered
     assert result == COMM_SUCCESS
     assert "Instruction code" in host.sdk.getRxPacketError(error)
-
-
-def test_lock_closes_the_eeprom_until_the_power_is_cut(connect: Any) -> None:
-    host = connect("renamed")
-    host.write(2, LOCK, 1)
-    assert host.refused(2, RETURN_DELAY, 100)
-    assert host.refused(2, LOCK, 0)
-    host.write(2, LED, 1)
-
-
-def test_registered_writes_happen_at_the_action_of_all(connect: Any) -> None:
-    host = connect("registered")
-    for each in (1, 2):
-        assert host.sdk.regWriteTxRx(host.port, each, *LED, [1]) == (COMM_SUCCESS, 0)
-    for led in (0, 1):
-        assert [host.read(each, LED) for each in (1, 2)] == [led] * 2
-        assert [host.read(each, REGISTERED) for each in (1, 2)] == [1 - led] * 2
-        if not led:
-            assert host.sdk.action(host.port, 0xFE) == COMM_SUCCESS
-
-
-def test_both_angle_limits_at_zero_make_a_wheel(connect: Any) -> None:
-    host = connect("wheel")
-    for item, value in ((CW_LIMIT, 0), (CCW_LIMIT, 0), (TORQUE, 1)):
-        host.write(1, item, value)
-    for clockwise in (0, 1 << 10):
-        host.write(1, SPEED, 300 | clockwise)
-        assert host.near(1, PRESENT_SPEED, clockwise + 300, 150)
-    host.write(1, SPEED, 0)
-    host.write(1, TORQUE, 0)
-
-
-def test_a_new_id_answers_where_the_old_one_is_silent(connect: Any) -> None:
-    host = connect("renamed")
-    host.write(1, ID, 200)
-    assert host.ping(200) == AX12
-    assert host.is_silent(1)
-    host.write(200, ID, 1)
-
-
-def test_factory_reset_answers_as_before_and_is_the_maker_s_servo_after(connect: Any) -> None:
-    host = connect("reset")
-    host.write(7, RETURN_DELAY, 0)
-    assert host.sdk.factoryReset(host.port, 7) == (COMM_SUCCESS, 0)
-    assert until(lambda: host.sdk.ping(host.port, 1)[0] == AX12)  # e-Manual, AX-12A: ID 1, 1 Mbit/s
-    assert host.read(1, RETURN_DELAY) == 250
-    assert host.sdk.factoryReset(host.port, 8) == (COMM_SUCCESS, 0)
-    assert host.port.setBaudRate(57_600)
-    assert until(lambda: host.sdk.ping(host.port, 1)[0] == MX28)  # e-Manual, MX-28: ID 1, 57,600 bit/s
-    assert host.read(1, BAUD_RATE) == 34

@@ -17,8 +17,7 @@ from dxlsim.simulation_plan import BusConfig, ServoConfig
 PROTOCOL = 2.0
 XL430, XM430 = 1060, 1020
 """Model numbers (e-Manual, control tables, Model Number (0))."""
-FIRMWARE, ID, BAUD_RATE, RETURN_DELAY, OPERATING_MODE = (Item(address, 1) for address in (6, 7, 8, 9, 11))
-TORQUE, LED, REGISTERED, MOVING = (Item(address, 1) for address in (64, 65, 69, 122))
+FIRMWARE, OPERATING_MODE, TORQUE, LED, MOVING = (Item(address, 1) for address in (6, 11, 64, 65, 122))
 GOAL_VELOCITY, PROFILE_VELOCITY, GOAL, PRESENT = (Item(address, 4) for address in (104, 112, 116, 132))
 INDIRECT_ADDRESS, INDIRECT_DATA = 168, 224
 
@@ -28,16 +27,14 @@ def two(model: str, name: str) -> BusConfig:
 
 
 BUSES = (
-    *(two("XL430-W250", name) for name in ("ping", "sync", "reset", "registered")),
-    *(two("XM430-W350", name) for name in ("read_write", "bulk", "indirect", "reboot")),
-    BusConfig("turns", 1_000_000, (ServoConfig(1, "XM430-W350", 6.2),), 2.0),
-    BusConfig("turning", 1_000_000, (ServoConfig(1, "XM430-W350", 1.0),), 2.0),
+    *(two("XL430-W250", name) for name in ("ping", "sync")),
+    *(two("XM430-W350", name) for name in ("read_write", "bulk", "indirect")),
     BusConfig("crowd", 1_000_000, tuple(ServoConfig(n, "XL430-W250", 1.0) for n in (0, 7, 40, 252)), 2.0),
 )
 
 
 def test_ping_on_two_ports_which_are_two_lines(connect: Any) -> None:
-    host, other = connect("ping"), connect("reboot")
+    host, other = connect("ping"), connect("indirect")
     assert [host.ping(each) for each in (1, 2)] == [XL430] * 2
     assert other.ping(1) == XM430
     assert host.is_silent(3)
@@ -139,66 +136,3 @@ def test_indirect_addresses_gather_items_in_one_block(connect: Any) -> None:
         return abs(reading.getData(1, INDIRECT_DATA + 5, 4) - goal) <= 20
 
     assert until(arrived)
-
-
-def test_a_reboot_brings_the_ram_to_its_start_and_keeps_the_eeprom(connect: Any) -> None:
-    host, indirect = connect("reboot"), Item(INDIRECT_ADDRESS, 2)
-    assert host.read(1, indirect) == INDIRECT_DATA  # e-Manual: each points at its own data
-    for item, value in ((indirect, PRESENT.address), (RETURN_DELAY, 100), (LED, 1), (TORQUE, 1)):
-        host.write(1, item, value)
-    assert host.sdk.reboot(host.port, 1) == (COMM_SUCCESS, 0)
-    assert host.answers_again(1)
-    assert [host.read(1, each) for each in (TORQUE, LED, RETURN_DELAY)] == [0, 0, 100]
-    assert host.read(1, indirect) == INDIRECT_DATA
-
-
-def test_factory_reset_keeps_what_its_option_names(connect: Any) -> None:
-    host = connect("reset")
-    host.write(2, RETURN_DELAY, 0)
-    assert host.sdk.factoryReset(host.port, 2, 0x02) == (COMM_SUCCESS, 0)  # all but ID and baud rate
-    assert host.answers_again(2)
-    assert (host.read(2, RETURN_DELAY), host.read(2, BAUD_RATE)) == (250, 3)
-    assert host.sdk.factoryReset(host.port, 2, 0x01) == (COMM_SUCCESS, 0)  # all but the ID
-    assert host.port.setBaudRate(57_600)
-    assert host.answers_again(2)
-    assert host.read(2, BAUD_RATE) == 1
-    assert host.sdk.factoryReset(host.port, 2, 0xFF) == (COMM_SUCCESS, 0)  # all: the ID of the other one, too
-    assert host.answers_again(1)  # at another rate
-    assert host.is_silent(2)
-
-
-def test_clear_multi_turn_brings_the_position_back_into_one_turn(connect: Any) -> None:
-    host = connect("turns")
-    for item, value in ((OPERATING_MODE, 4), (TORQUE, 1), (GOAL, 4300)):
-        host.write(1, item, value)
-    assert host.near(1, PRESENT, 4300)
-    assert host.near(1, MOVING, 0, 0)
-    before = host.read(1, PRESENT)
-    host.write(1, TORQUE, 0)
-    assert host.sdk.clearMultiTurn(host.port, 1) == (COMM_SUCCESS, 0)
-    assert abs(host.read(1, PRESENT) - (before - 4096)) <= 2
-
-
-def test_clear_multi_turn_fails_while_the_servo_moves(connect: Any, simulation: Any) -> None:
-    host = connect("turning")
-    for item, value in ((OPERATING_MODE, 4), (PROFILE_VELOCITY, 30), (TORQUE, 1), (GOAL, 100_000)):
-        host.write(1, item, value)
-    assert host.near(1, MOVING, 1, 0)
-    simulation.expect_refusals("turning", 1)
-    assert host.sdk.clearMultiTurn(host.port, 1) == (COMM_SUCCESS, 1)  # e-Manual, Clear: Result Fail
-    host.write(1, TORQUE, 0)
-
-
-def test_registered_writes_happen_at_the_action_of_all_and_a_new_id_at_once(connect: Any) -> None:
-    host = connect("registered")
-    for each in (1, 2):
-        assert host.sdk.regWriteTxRx(host.port, each, *LED, [1]) == (COMM_SUCCESS, 0)
-    for led in (0, 1):
-        assert [host.read(each, LED) for each in (1, 2)] == [led] * 2
-        assert [host.read(each, REGISTERED) for each in (1, 2)] == [1 - led] * 2
-        if not led:
-            assert host.sdk.action(host.port, 0xFE) == COMM_SUCCESS
-    host.write(2, ID, 200)
-    assert host.ping(200) == XL430
-    host.write(200, ID, 2)
-    assert host.ping(2) == XL430
