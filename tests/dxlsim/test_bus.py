@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.kit.line_faults import turn_by_hand
 from tests.kit.packets import packet1, packet2
 from tests.kit.simulated_line import Line, split_statuses
 
@@ -86,13 +85,6 @@ def test_what_is_read_is_the_state_when_the_instruction_arrived():
     assert positions[0] < positions[1]
 
 
-def test_two_instructions_in_one_write_are_both_obeyed():
-    bus = new_bus()
-    bus.receive_bytes(packet1(0xFE, 3, 25, 1) + PING_1, 0)
-    assert bus.drain_bytes(LATER) == PONG_1
-    assert bus.servo(2).registers["led"] == 1
-
-
 @pytest.mark.parametrize(("split", "received"), [("whole", "ff ff"), ("byte", "ff ff")])
 def test_who_talks_into_a_reply_loses_both(split, received):
     bus = new_bus(AdapterConfig(split=split))
@@ -111,22 +103,6 @@ def test_a_host_that_sends_within_the_return_delay_is_received():
     assert len(received) == 14
     assert received[:8] == bytes.fromhex("ff ff 01 08 00 87 01 00")  # the begin of the first reply, alone
     assert " overlaps " in notes(bus)
-
-
-def test_two_servos_with_one_id_garble_what_differs():
-    bus = new_bus(ids=(1, 1))
-    turn_by_hand(bus.servos[1], 3.0)
-    bus.receive_bytes(PING_1, 0)
-    assert bus.drain_bytes(10**9) == PONG_1  # equal bytes, in step: nothing to be seen
-    bus.receive_bytes(READ_1, 10**9)
-    assert sum(bus.drain_bytes(LATER)[2:]) & 0xFF != 0xFF
-
-
-def test_noise_toward_the_host_takes_wire_time():
-    bus = new_bus()
-    bus.inject_noise(b"\x12\x34", 5_000)
-    assert bus.drain_bytes(24_999) == b""
-    assert bus.drain_bytes(25_000) == b"\x12\x34"
 
 
 def test_bytes_that_no_host_takes_do_not_pile_up():

@@ -51,13 +51,6 @@ def test_times_count_from_the_start_of_the_simulation():
     assert not ping(line)
 
 
-def test_a_fault_that_waits_for_its_packet_has_not_happened():
-    line = Line()
-    script = line.inject("lose servo=1 count=3")
-    assert ping(line, 2)
-    assert (line.faults, [str(fault) for fault in script.waiting]) == ([], ["lose servo=1 count=3"])
-
-
 def test_faults_by_hand_overlap_with_those_of_the_script():
     line = Line()
     script = line.inject("silence servo=1 for=50ms")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 import pytest
 
 from dxlsim.motion.control_law import LIMP, ServoCommand
@@ -19,7 +18,7 @@ from dxlsim.motion.mechanics import (
 )
 from dxlsim.motion.motor import Motor, motor_of
 from dxlsim.simulation_plan import NO_LOAD, Load
-from dxlwire.control_table import all_tables, find_table
+from dxlwire.control_table import all_tables
 
 MOTOR = Motor(stall_torque=2.0, damping=1 / 3, torque_per_ampere=2.0, voltage=12.0, inertia=0.003)
 S = 1_000_000_000
@@ -86,17 +85,8 @@ def test_every_model_has_a_motor_that_turns():
     for table in tables:
         mechanics.command_servo(mechanics.add_servo(motor_of(table), NO_LOAD, 0.0), FULL)
     mechanics.step_to(S // 2)
-    motors = [motor_of(table) for table in tables]
-    assert mechanics.plant.velocity == pytest.approx([motor.no_load_speed for motor in motors], rel=1e-3)
-    scaled = [pair for pair in zip(motors, tables, strict=True) if "[i]" in pair[0].source]
-    assert len(scaled) == len(tables) - 7  # MX-64 and MX-106 of both protocols, XL-320, XL330-M288 of two
-    assert all(motor.no_load_speed == pytest.approx(table.max_speed) for motor, table in scaled)
-
-
-def test_torque_figures_are_those_of_the_tables():
-    motor = motor_of(find_table("XM430-W350"))
-    assert (motor.no_load_speed, motor.stall_torque) == pytest.approx((4.817, 4.1), rel=1e-3)
-    assert np.isclose(motor.torque_per_ampere, 4.1 / 2.3)
+    speeds = [motor_of(table).no_load_speed for table in tables]
+    assert mechanics.plant.velocity == pytest.approx(speeds, rel=1e-3)
 
 
 # Load
@@ -144,13 +134,6 @@ def test_within_the_margin_nothing_drives_and_beyond_it_the_punch_does():
     soft = pid(2.0, 1.0, margin_ccw=0.1, margin_cw=0.1, punch=0.05)
     assert after(1, soft, angle=0.91) == (0.91, 0.0)
     assert 0.9 <= after(1, soft, Load(friction=0.09), angle=0.89)[0] < 0.95  # the punch gives 0.1 Nm
-
-
-def test_each_side_has_a_margin_and_a_slope_of_its_own():
-    load = Load(gravity=0.4, gravity_angle=1.0)
-    sides = pid(2.0, 1.0, p_cw=20.0, margin_ccw=0.2)
-    assert after(3, sides, load, angle=0.6)[0] == pytest.approx(1.0, abs=0.2)
-    assert after(3, sides, load, angle=1.4)[0] == pytest.approx(1.0, abs=0.02)
 
 
 # Time
@@ -213,19 +196,6 @@ def test_geared_load_turns_with_a_shaft_that_is_put_within_half_a_turn(by):
         mechanics.step_to(50_000_000)
         speeds.append(mechanics.plant.velocity.item(0))
     assert speeds[1] == speeds[0] != 0.0
-
-
-def test_a_geared_load_hangs_where_it_was_when_a_turn_is_counted_again():
-    speeds = []
-    for turns in (0, 1):
-        mechanics = Mechanics(0)
-        load = Load(gravity=1.0, gravity_angle=0.5, turns=0.5)
-        mechanics.add_servo(motor_of(find_table("XM430-W350")), load, 2.0)
-        mechanics.recount_turns(0, 2.0 + turns * math.tau)
-        mechanics.step_to(50_000_000)
-        speeds.append(mechanics.plant.velocity.item(0))
-    assert speeds[1] == pytest.approx(speeds[0])
-    assert speeds[0] < -0.1
 
 
 # Heat and overload

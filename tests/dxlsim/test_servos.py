@@ -5,25 +5,12 @@ from __future__ import annotations
 import pytest
 from tests.kit.simulated_line import Line
 
-from dxlsim.registers.memory import Memory
 from dxlsim.servo.making import make_servo
 from dxlsim.simulation_plan import ServoConfig
-from dxlwire.control_table import find_table
 
 BACKUP, FAST_SYNC_READ, ACCESS = 0x20, 0x8A, 7
 BACK_UP = bytes.fromhex("01 4354524c")
-DAMAGED = {"AX-12A": ("ff ff 01 04 03 19 01 00", 0x10), "XM430-W350": ("fffffd00 01 0600 03 410001 0000", 3)}
 """An instruction with a wrong checksum, and the error of its answer."""
-
-
-@pytest.mark.parametrize("model", DAMAGED)
-def test_servo_that_answers_damaged_instructions_reports_them_and_does_not_obey(model):
-    line = Line(model)
-    line.servo().answers_damaged = True
-    instruction, error = DAMAGED[model]
-    line.send(bytes.fromhex(instruction))
-    assert line.statuses() == [(1, error, b"")]
-    assert line.get("led") == 0
 
 
 @pytest.mark.parametrize(("model", "most_ns"), [("AX-12A", 100_000_000), ("XM430-W350", 1_500_000)])
@@ -81,19 +68,6 @@ def test_position_of_a_wheel_stays_in_its_range():
     seen = {line.get("present_position") for _ in range(200)}
     assert (min(seen), max(seen)) == (0, 1023)
     assert len(seen) > 50
-
-
-def test_values_and_bytes_of_the_registers_never_differ():
-    table = find_table("AX-12A")
-    registers = Memory(table, 24)
-    for run in registers.runs(26, bytes((5, 6, 7, 8, 0x23, 0x01))):
-        registers.write_run(run)
-    registers["moving_speed"] = 77
-    for item in table.items.values():
-        data = registers.read_bytes(item.address, item.size)
-        assert data is not None
-        assert int.from_bytes(data, "little") == registers[item.name]
-    assert registers["goal_position"] == 0x123
 
 
 @pytest.mark.parametrize(
