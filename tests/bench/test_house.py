@@ -47,12 +47,6 @@ def test_a_word_is_mentioned_in_code_outside_its_folder_only() -> None:
     assert [path.rpartition("/")[2] for path in found] == ["key.py", "name.py", "kernel.c"]
 
 
-def test_a_twist_does_not_ask_whether_a_joint_is_linear() -> None:
-    codes = {"twist.py": "a = twist.linear.x", "joint.py": "a = joint.linear", "plan.py": "plan(linear=True)"}
-    codes |= {"unit.py": "a = joint.unit is not LINEAR", "table.py": "a = {ROTARY: 1.0, LINEAR: 0.1}"}
-    assert house.mentioning(codes, house.LINEAR) == ["joint.py", "plan.py", "unit.py"]
-
-
 def test_a_room_is_a_library_a_package_or_a_feature() -> None:
     rooms = {
         "runtime/dxlwire/wire/crc.py": "dxlwire",
@@ -68,35 +62,3 @@ def test_a_room_is_a_library_a_package_or_a_feature() -> None:
 def test_only_public_functions_of_modules_and_classes_are_without_an_object() -> None:
     texts = {"a.py": "def take(): ...\nclass A:\n def look(self):\n  def end(): ...\n def _read(self): ..."}
     assert [name for _, name in house.bare_functions(texts)] == ["take", "look"]
-
-
-def test_a_parameter_is_handed_on_if_each_use_is_an_argument() -> None:
-    text = """
-class A:
-    def __init__(self, given, kept, asked, read):
-        f(given, *given, by=given)
-        self._kept, self._asked = None, asked
-        self._kept = kept
-        g(read.part)
-    def go(self, unused):
-        f(self._kept)
-@dataclass
-class B:
-    _field: int
-    public: int
-    state: int = field(init=False)
-    def go(self):
-        f(self._field, self.public)
-class C(Protocol):
-    def go(self, x): ...
-"""
-    found = [(one.owner, one.is_built, one.handed_on) for one in house.parameters({"a.py": text})]
-    assert sorted(found) == [
-        ("A", True, False),
-        ("A", True, False),
-        ("A", True, True),
-        ("A", True, True),
-        ("B", True, False),
-        ("B", True, True),
-        ("go", False, False),
-    ]

@@ -63,60 +63,12 @@ def talk(line, *transactions, protocol=1.0):
     return replies
 
 
-def test_a_reply_in_two_pieces():
-    line = ScriptedLine([(600_000, GOOD[:5]), (690_000, GOOD[5:])])
-    (reply,) = talk(line, READ)
-    assert (reply.outcome, reply.parameters, reply.last_ns) == (OK, b"abcdef", 691_000)
-    assert line.sink.packets == [
-        (0, INSTRUCTION, 7, 1_000, 1_000, READ.packet),
-        (0, STATUS, 7, 601_000, 691_000, GOOD),
-    ]
-
-
 def test_a_longer_reply_in_two_pieces_is_awaited_to_its_last_byte():
     longer = protocol1.status_packet(7, 0, b"abcdefg")
     line = ScriptedLine([], [(600_000, longer[:-1]), (690_000, longer[-1:])])
     lost, reply = talk(line, LINE.read_range(7, 24, 6), LINE.read_range(7, 36, 6, spare=1))
     assert line.written[-1] == protocol1.read_range(7, 36, 7), "a reply of 6 bytes is owed"
     assert (lost.outcome, reply.outcome, reply.parameters) == (TIMEOUT, OK, b"abcdef")
-
-
-def test_silence_is_waited_out():
-    line = ScriptedLine([], [(700_000, GOOD)])
-    reply, after = talk(line, READ, READ)
-    assert (reply.outcome, after.outcome) == (TIMEOUT, OK)
-    assert line.clock.now_ns() == 1_000 + READ.timeout_ns + 700_000
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        protocol1.status_packet(8, 0, b"abcdef"),
-        protocol1.status_packet(7, 0, b"abcde"),
-        protocol1.status_packet(7, 0, b"abcdefg"),
-        protocol1.status_packet(7, 0, b""),
-        GOOD[:-1] + b"\x00",
-        GOOD[:6],
-    ],
-    ids=["ID", "too short", "too long", "empty", "checksum", "cut"],
-)
-def test_only_the_right_id_the_right_length_and_checksum_count(wrong):
-    line = ScriptedLine([(700_000, wrong)], [(700_000, GOOD)])
-    reply, after = talk(line, READ, READ)
-    assert (reply.outcome, after.parameters) == (GARBLED, b"abcdef")
-    assert line.sink.received == wrong + GOOD
-
-
-def test_a_refusal_is_not_waited_out():
-    line = ScriptedLine([(700_000, protocol1.status_packet(7, 0x08))])
-    (reply,) = talk(line, READ)
-    assert (reply.outcome, reply.error, reply.answered) == (TransactionOutcome.REFUSED, 8, False)
-    assert line.clock.now_ns() == 701_000
-
-
-def test_an_answer_that_comes_sooner_than_the_wire_allows_is_an_older_one():
-    (reply,) = talk(ScriptedLine([(150_000, STALE), (700_000, GOOD)]), READ)
-    assert (reply.parameters, reply.strays) == (b"abcdef", 1)
 
 
 def test_after_a_timeout_the_line_is_drained_until_it_is_silent():

@@ -3,17 +3,13 @@
 import pytest
 from tests.kit.rigs import make_x
 
-from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.servo.item_access import access_servo
-from dxlrun.dynamixel.servo.registers import write_registers
-from dxlwire.bus_plan import RegisterValue
 from dxlwire.control_table import decoded, find_table
 from dxlwire.transaction import Reply, TransactionOutcome
 
 PLAN = make_x((11,))
 ONE = access_servo(PLAN, PLAN.servos[0])
 READ, WRITE = 2, 3
-GAIN = RegisterValue(84, 2, 900, "position_p_gain")
 
 
 def played(program, *answers):
@@ -79,22 +75,6 @@ def test_items_are_read_side_by_side_and_none_counts_where_one_does_not_come():
     assert sent == [(READ, 64), (READ, 80)]
     found, _ = played(ONE.read_items(names), b"\1\0", TransactionOutcome.TIMEOUT)
     assert found is None
-
-
-def test_a_register_is_written_again_until_it_is_read_back():
-    right, wrong = (900).to_bytes(2, "little"), (800).to_bytes(2, "little")
-    assert played(ONE.write_item(GAIN.name, GAIN.value), b"", wrong, b"", right)[0] == ""
-    problem, sent = played(ONE.write_item(GAIN.name, GAIN.value), b"", wrong, b"", wrong, b"", wrong)
-    assert problem == "has Position P Gain (84) = 800 after 900 was written"
-    assert sent == [(WRITE, 84), (READ, 84)] * 3
-
-
-def test_nothing_is_written_where_one_register_cannot_be_read():
-    found, other = Findings(), RegisterValue(80, 2, 5, "position_d_gain")
-    before, sent = played(write_registers(ONE, (GAIN, other), found), b"\0\0", TransactionOutcome.TIMEOUT)
-    assert found.problems == [f"{ONE} did not answer when Position D Gain (80) was read"]
-    assert before == {"position_p_gain": 0}
-    assert {instruction for instruction, _ in sent} == {READ}
 
 
 def test_only_items_that_lie_whole_in_the_bytes_are_decoded():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from tests.kit.rigs import make_plan, position_tick, speed_tick
+from tests.kit.rigs import make_plan
 
 import fuzz_kernel as fuzz
 from dxlrun.dynamixel.servo.life import ServoEvent
@@ -157,26 +157,6 @@ def test_a_servo_with_torque_and_a_goal_in_its_mode_gets_that_and_no_other_does(
         and mode is not Mode.UNKNOWN
         and not math.isnan(values[LEADS.get(mode, 0)][servo.row])
     }
-
-
-@given(
-    positions=st.lists(st.floats(-10, 10) | st.just(math.nan), min_size=8, max_size=8),
-    velocities=st.lists(
-        st.floats(-100, 100) | st.sampled_from([math.nan, 0.0, -0.0]), min_size=8, max_size=8
-    ),
-)
-@settings(max_examples=60, deadline=None)
-def test_the_sync_write_is_what_the_units_of_one_servo_say(positions, velocities):
-    writer = Writer(make_plan())
-    writer.goals.values[:] = [positions, velocities, [np.nan] * 8, [np.nan] * 8]
-    writer.include(set(range(8)) - {1})
-    expected = {
-        servo.servo_id: position_tick(servo, positions[servo.row]).to_bytes(2, "little")
-        + speed_tick(servo, velocities[servo.row]).to_bytes(2, "little")
-        for index, servo in enumerate(writer.plan.servos)
-        if index != 1 and not math.isnan(positions[servo.row])
-    }
-    assert writer.write() == ([protocol1.sync_write(30, 4, expected)] if expected else [])
 
 
 @pytest.mark.parametrize("dialect", [protocol1, protocol2], ids=["protocol 1", "protocol 2"])

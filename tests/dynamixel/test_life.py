@@ -1,4 +1,4 @@
-"""A servo's life: each legal transition is reached by what a simulated servo does, the others are refused."""
+"""A servo's life: what follows from each transition, and that no fault causes another one."""
 
 import itertools
 
@@ -7,7 +7,7 @@ import pytest
 from msgspec.structs import replace
 from tests.kit.campaigns import campaign
 from tests.kit.line_faults import truncate_next
-from tests.kit.rigs import goals_in, make_plan, make_rig
+from tests.kit.rigs import goals_in, make_plan, make_rig, start_rig
 
 from dxlrun.channels.cycle import SourceStates, States
 from dxlrun.dynamixel.servo import life
@@ -23,10 +23,9 @@ from dxlrun.dynamixel.servo.watchdog import RETURN_SPEED
 from dxlwire.exchange.cyclic_reads import CyclicReads
 from dxlwire.exchange.owed import OwedReplies
 from dxlwire.exchange.samples import Samples
-from dxlwire.modes import Mode
 
-LIMP, RELEASED, OFFLINE, GIVEN = ServoState.LIMP, ServoState.RELEASED, ServoState.OFFLINE, ServoState.GIVEN
-RETURNING, STOPPED, HOLDING = ServoState.RETURNING, ServoState.STOPPED, ServoState.HOLDING
+RELEASED, OFFLINE, GIVEN = ServoState.RELEASED, ServoState.OFFLINE, ServoState.GIVEN
+RETURNING, STOPPED = ServoState.RETURNING, ServoState.STOPPED
 LEGAL = {(state, event) for state, events in TRANSITIONS.items() for event in events}
 
 
@@ -80,189 +79,28 @@ def test_a_released_servo_gets_no_goals_on_any_way_but_a_return_or_a_request():
     assert reached == {RELEASED, OFFLINE}
 
 
-@pytest.fixture
-def recorded(monkeypatch):
-    """Every transition that was made, as (state, event)."""
-    made = []
-    on = Life.on
-
-    def recording(self, index, event):
-        made.append((self.states[index], event))
-        return on(self, index, event)
-
-    monkeypatch.setattr(Life, "on", recording)
-    return made
-
-
-class Story:
-    """Servo 12 of a bus of three, which lives through something."""
-
-    def __init__(self, protocol=2.0):
-        model = {} if protocol == 1.0 else {"protocol": 2.0, "model": "XM430-W350"}
-        plan = make_plan((11, 12, 13), name="arm", return_delay_ns=0, **model)
-        self.plan = replace(plan, watchdog_ticks=10 if protocol == 2.0 else 0)
-        self.rig = make_rig(self.plan)
-        self.servo, self.hardware = self.rig.servo(12), self.rig.hardware
-        self.life = self.hardware._servos[0].life
-
-    @property
-    def state(self):
-        return self.life.states[1]
-
-    def until(self, *states):
-        for _ in range(200):
-            if self.state in states:
-                return
-            self.rig.cycle()
-        raise AssertionError(f"it is {self.state}")
-
-    def answers_until(self, *states):
-        self.servo.silence(False)
-        self.until(*states)
-
-    def lose(self):
-        self.servo.silence()
-        self.until(OFFLINE)
-
-    def reset(self):
-        """Let it start again while it is away, and come back limp."""
-        self.lose()
-        self.returned_limp()
-
-    def start_and_reset(self):
-        self.hardware.start()
-        self.reset()
-
-    def miss(self):
-        self.servo.silence()
-        self.rig.cycle()
-
-    def come_to(self, state):
-        """Bring the servo into a state by what happens to a real one."""
-        if state is LIMP and self.plan.protocol == 2.0:
-            return  # not started yet
-        self.hardware.start()
-        if state in {LIMP, GIVEN}:
-            self.reset()
-        if state is RELEASED:
-            self.hardware.switch_torque(1, False)
-            self.rig.cycles(5)
-        elif state is OFFLINE:
-            self.lose()
-        elif state is GIVEN:
-            self.rig.anchors = False
-            self.hardware.switch_torque(1, True)
-        elif state in {RETURNING, STOPPED}:
-            self.rig.goals.position[1] += 1.0
-            self.lose()
-            self.answers_until(RETURNING)
-        if state in {HOLDING, STOPPED}:
-            self.miss()
-        self.until(state)
-
-    # What happens, by the name of its event
-
-    def engaged(self):
-        self.hardware.start()
-
-    def torque_on(self):
-        self.answers_until(ServoState.TORQUED, RETURNING)
-
-    def torque_off(self):
-        """A servo of Protocol 1.0 shuts down: its torque enable stays 1, its Torque Limit is 0."""
-        self.servo.trigger_overload()
-        self.servo.silence(False)
-        self.rig.cycles(10)
-
-    def doubt(self):
-        if self.state is OFFLINE:
-            self.hardware.stop()
-            return
-        for _ in range(30):
-            self.miss()
-
-    def watchdog(self):
-        if self.state is LIMP:
-            self.start_and_reset()
-        self.rig.clock.wait_until(self.rig.clock.now_ns() + 300_000_000)
-        self.rig.cycle(idle=False)
-
-    def caught_up(self):
-        self.until(ServoState.TORQUED)
-
-    def lost(self):
-        if self.state is LIMP:
-            self.start_and_reset()
-        self.rig.buses[0].unplug()
-        self.rig.goals.position[0] += 0.1
-        self.hardware.write_goals()
-        self.rig.buses[0].plug_in()
-        self.hardware.idle(self.rig.clock.now_ns() + 10_000_000)
-
-    def torque_given(self):
-        if self.state is LIMP:
-            self.requested()
-        elif self.state is OFFLINE:
-            self.lost()
-        else:
-            self.rig.set_modes(0, Mode.VELOCITY, 0)
-        self.servo.silence(False)
-        for _ in range(60):
-            self.rig.cycle()
-            if self.state is GIVEN and self.rig.states.mode[1] != Mode.UNKNOWN:
-                return
-
-    def anchored(self):
-        self.rig.anchors = True
-        self.rig.cycle()
-
-    def returned(self):
-        self.answers_until(RETURNING)
-
-    def returned_limp(self):
-        self.servo.power_cycle()
-        self.answers_until(LIMP)
-
-    def release(self):
-        self.hardware.switch_torque(1, False)
-
-    def requested(self):
-        if self.state is LIMP:
-            self.start_and_reset()
-        self.hardware.switch_torque(1, True)
-
-
-@pytest.mark.parametrize(("state", "event"), sorted(LEGAL, key=str))
-def test_each_legal_transition_is_reached_by_what_a_servo_does(recorded, state, event):
-    story = Story(protocol=1.0 if event is ServoEvent.TORQUE_OFF else 2.0)
-    story.come_to(state)
-    recorded.clear()
-    getattr(story, event.name.lower())()
-    assert (state, event) in recorded
-
-
-def test_a_servo_that_is_lost_after_it_was_let_go_is_released_again_when_it_is_back():
-    story = Story()
-    story.come_to(RELEASED)
-    story.lose()
-    story.answers_until(RELEASED, LIMP, RETURNING)
-    assert story.state is RELEASED
-    assert story.rig.torque() == [True, False, True]
+def three_servos(protocol):
+    """Return hardware that holds three servos."""
+    model = {} if protocol == 1.0 else {"protocol": 2.0, "model": "XM430-W350"}
+    plan = make_plan((11, 12, 13), name="arm", return_delay_ns=0, **model)
+    return start_rig(replace(plan, watchdog_ticks=10 if protocol == 2.0 else 0))
 
 
 def test_torque_that_was_read_before_a_servo_was_let_go_gives_it_no_goals():
     """Its torque enable is still being read when the policy comes: the late 1 must not count."""
-    story = Story(protocol=1.0)
-    story.come_to(HOLDING)
-    rig = story.rig
+    rig = three_servos(1.0)
     rig.restless = 0.02
-    story.servo.silence(False)
+    servo, life = rig.servo(12), rig.hardware._servos[0].life
+    servo.silence()
+    rig.cycle()
+    assert life.states[1] is ServoState.HOLDING
+    servo.silence(False)
     rig.cycle(idle=False)
     rig.hardware._servos[0].schedule_reads(0)  # the read is due, and waits for idle time
     rig.hardware.switch_torque(1, False)
     since = len(rig.into_bus())
     rig.cycles(20)
-    assert story.state is RELEASED
+    assert life.states[1] is RELEASED
     goals = rig.goals_sent(since)
     assert goals
     assert not any(12 in ids for _, ids in goals)
@@ -273,9 +111,8 @@ def test_torque_that_was_read_before_a_servo_was_let_go_gives_it_no_goals():
 @pytest.mark.parametrize("protocol", [1.0, 2.0])
 def test_faults_in_random_order_cause_only_legal_transitions(number, protocol, chance):
     """And no goal goes to a servo whose torque was not read as on since the last doubt."""
-    story = Story(protocol)
-    rig, line = story.rig, story.rig.buses[0]
-    rig.hardware.start()
+    rig = three_servos(protocol)
+    line, life = rig.buses[0], rig.hardware._servos[0].life
     rig.restless = 0.002  # a goal to each in every cycle
     let_go: set[int] = set()
     answers: list[list[str]] = []
@@ -319,7 +156,7 @@ def test_faults_in_random_order_cause_only_legal_transitions(number, protocol, c
             begun = len(rig.into_bus())
             rig.hardware.read_states()
             rig.hardware.write_goals()
-            servos = zip(story.plan.servos, story.life.torqued, strict=True)
+            servos = zip(rig.plans[0].servos, life.torqued, strict=True)
             gets = {servo.servo_id for servo, on in servos if on}
             for packet in rig.into_bus()[begun:]:
                 address, named = goals_in(packet, protocol) or (0, [])
@@ -327,7 +164,7 @@ def test_faults_in_random_order_cause_only_legal_transitions(number, protocol, c
             rig.hardware.idle(rig.clock.now_ns() + 15_000_000)
             rig.clock.wait_until(rig.clock.now_ns() + 5_000_000)
             for index in let_go:
-                assert story.life.states[index] in {RELEASED, OFFLINE}
+                assert life.states[index] in {RELEASED, OFFLINE}
     line.plug_in()
     for servo in line.servos:
         servo.silence(False)

@@ -1,17 +1,11 @@
-"""Samples: the replies of a cycle make the states that the same rules make of one servo, in plain numbers."""
-
-import math
-import random
-import struct
+"""Samples: the states of joints that the replies of a cycle make, and positions that are not believed."""
 
 import numpy as np
 import pytest
-from msgspec.structs import replace
 from tests.kit.rigs import make_plan, make_rig
 
-import fuzz_kernel as fuzz
 from dxlrun.channels.event_records import EventCode
-from dxlwire.exchange.samples import MARGIN_NS, MARGIN_RAD, REPORT_AGAIN_NS, Jumps
+from dxlwire.exchange.samples import REPORT_AGAIN_NS
 from dxlwire.modes import Mode
 
 MS = 1_000_000
@@ -113,134 +107,6 @@ def test_the_speed_of_a_wheel_that_controls_none_is_a_part_of_full_output(mode):
     unit = wheels[0] if mode in (Mode.VELOCITY, Mode.PWM) else servo.rad_s_per_tick
     assert wheels[0] != servo.rad_s_per_tick
     assert robot.states.velocity == pytest.approx([-100 * unit, 100 * wheels[1]])
-
-
-class OneServo:
-    """The rules of the states for one servo, in plain numbers."""
-
-    def __init__(self, plan, servo):
-        self.servo = servo
-        self.fastest = float(Jumps([plan], None)._fastest[plan.servos.index(servo)])
-        self.shown, self.shown_ns, self.valid = (math.nan,) * 3, None, False
-
-    def cycle(self, raw, at_ns):
-        """Take a sample that arrived, None where none did."""
-        self.valid = False
-        if raw is None:
-            return
-        position, velocity, effort = raw
-        if self.servo.state.velocity.encoding == "sign_magnitude":
-            velocity, effort = (value % 0x400 * (-1 if value & 0x400 else 1) for value in (velocity, effort))
-        found = (
-            self.servo.joint_position(position),
-            self.servo.direction * velocity * self.servo.rad_s_per_tick,
-            self.servo.direction * effort * self.servo.effort_per_tick,
-        )
-        if self.shown_ns is not None:
-            time = (at_ns - self.shown_ns + MARGIN_NS) * 1e-9
-            if abs(found[0] - self.shown[0]) > MARGIN_RAD + self.fastest * time:
-                return
-        self.shown, self.shown_ns, self.valid = found, at_ns, True
-
-
-ROBOTS = {
-    "one bus": [("AX-12A", 8)],
-    "two layouts by turns": [("XM430-W350", "XL-320", 7)],
-    "two layouts one behind the other": [("XM430-W350", 3), ("XL430-W250", "XL-320", 2)],
-    "several buses": [("XM430-W350", 5), ("AX-12A", 3), ("XL-320", 2), ("MX-28", 1)],
-}
-
-
-@pytest.mark.parametrize("order", ["as wired", "in another order"])
-@pytest.mark.parametrize("name", ROBOTS)
-def test_states_are_what_the_rules_make_of_each_servo(name, order):
-    rng = random.Random(f"{name} {order}")
-    total = sum(count for *_, count in ROBOTS[name])
-    rows = rng.sample(range(total), total) if order == "in another order" else list(range(total))
-    plans = []
-    for number, (*turns, count) in enumerate(ROBOTS[name]):
-        ids, mine = range(1, count + 1), rows[:count]
-        models = [turns[index % len(turns)] for index in range(count)]
-        protocol = 1.0 if models[0] in ("AX-12A", "MX-28") else 2.0
-        plan = make_plan(ids, name=f"bus{number}", models=models, protocol=protocol)
-        servos = tuple(replace(servo, row=row) for servo, row in zip(plan.servos, mine, strict=True))
-        plans.append(replace(plan, servos=servos))
-        del rows[:count]
-    robot = Robot(*plans)
-    ones = [OneServo(plan, servo) for plan in plans for servo in plan.servos]
-    middle = [rng.randrange(300, 700) for _ in ones]
-    quick = 0
-    for _ in range(150):
-        lost = rng.choice([0.0, 0.0, 0.0, 0.2, 0.9])
-        far = rng.choice([0.0, 0.0, 0.0, 0.3])
-        fresh = [rng.random() >= lost for _ in ones]
-        ages = [rng.randrange(4 * MS) for _ in ones]
-        raws = []
-        for index, servo in enumerate(robot.servos):
-            middle[index] += rng.randrange(-3, 4)
-            position = max(0, middle[index] + (rng.randrange(-300, 300) if rng.random() < far else 0))
-            signed = servo.state.velocity.encoding == "twos_complement"
-            speeds = [rng.randrange(-300, 300) if signed else rng.randrange(0x800) for _ in range(2)]
-            raws.append((position, *speeds))
-            if fresh[index]:
-                robot.put(index, *raws[-1])
-        robot.settle(fresh, ages, after_ns=rng.choice([5 * MS, 20 * MS, 400 * MS]))
-        for one, came, raw, age in zip(ones, fresh, raws, ages, strict=True):
-            one.cycle(raw if came else None, robot.now_ns - age)
-            row, states = one.servo.row, robot.states
-            assert states.valid[row] == one.valid
-            assert states.motion[:, row] == pytest.approx(one.shown, nan_ok=True, rel=1e-12)
-            assert states.age_ns[row] == (-1 if one.shown_ns is None else robot.now_ns - one.shown_ns)
-        quick += all(one.valid for one in ones)
-    assert 20 < quick < 145
-
-
-NUMBERS = {"unsigned": "BHI", "twos_complement": "bhi", "float32": "  f"}
-"""Formats of Python's `struct` for one, two and four bytes."""
-
-
-def told(field, data):
-    """Return the state that a block of bytes has of a device, by plain rules."""
-    place = field.place
-    (number,) = struct.unpack_from("<" + NUMBERS[place.encoding][place.size // 2], data, place.offset)
-    if place.bit is not None:
-        number = number >> place.bit & 1
-    return number * field.scale + field.offset
-
-
-@pytest.mark.parametrize("name", ["bulk read with devices", "fast bulk read with devices"])
-def test_states_of_devices_are_what_the_rules_make_of_their_bytes(name):
-    rng = random.Random(name)
-    plans, _ = fuzz.robot(name, 2)
-    side = fuzz.Side(plans)
-    samples, sources, now_ns = side.hardware._samples, side.sources, SECOND_NS
-    shown, values = [-1] * len(sources.valid), np.full(len(sources.values), np.nan)
-    seen = set()
-    for _ in range(200):
-        now_ns += 10 * MS
-        valid = [False] * len(shown)
-        for bus, plan in zip(samples.buses, plans, strict=True):
-            bus.clear_fresh()
-            member = len(plan.servos)
-            for device in plan.devices:
-                found, times = {}, []
-                for block in device.blocks:
-                    data, at_ns = rng.randbytes(block.length), now_ns - rng.randrange(4 * MS)
-                    if rng.random() < 0.8:
-                        bus.store_state(member, data, at_ns)
-                        times.append(at_ns)
-                        found |= {field.column: told(field, data) for field in block.fields}
-                    member += 1
-                if len(times) == len(device.blocks) and all(map(math.isfinite, found.values())):
-                    valid[device.source], shown[device.source] = True, min(times)
-                    for column, value in found.items():
-                        values[column] = value
-        samples.fill_states(now_ns)
-        assert sources.valid.tolist() == valid
-        assert sources.values == pytest.approx(values, nan_ok=True, rel=1e-12)
-        assert sources.age_ns.tolist() == [-1 if at_ns < 0 else now_ns - at_ns for at_ns in shown]
-        seen.add(tuple(valid))
-    assert len(seen) > 4
 
 
 class TestJumps:

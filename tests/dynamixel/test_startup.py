@@ -6,15 +6,15 @@ from functools import partial
 
 import pytest
 from msgspec.structs import replace
-from tests.kit.line_faults import delay_next, disturb_replies, truncate_next
+from tests.kit.line_faults import disturb_replies, truncate_next
 from tests.kit.plans import distinct_tables
 from tests.kit.rigs import make_plan, make_rig, make_x, start_rig
 
-from dxlrun.channels.event_records import EventCode, Severity
+from dxlrun.channels.event_records import EventCode
 from dxlrun.compile.joints.register_values import UnfitRegister
 from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.servo.item_access import first_reach
-from dxlrun.dynamixel.servo.registers import read_registers, write_registers
+from dxlrun.dynamixel.servo.registers import write_registers
 from dxlrun.errors import PortError, StartUpError
 from dxlrun.features.registers.settings import declarable, register_value
 from dxlsim.bus.simulated_bus import PacketFault
@@ -69,19 +69,6 @@ def test_a_servo_with_the_id_of_another_is_read_no_further():
     rig.refused()
     asked = [packet for packet in rig.into_bus() if packet[2] == 5]
     assert asked == [protocol1.ping(5)] * 3
-
-
-def test_answers_that_come_late_are_those_to_what_was_asked():
-    """A host or an adapter that stands still for 200 ms: given up, they would answer what is asked next."""
-    rig = make_rig()
-    for servo in rig.plans[0].servos:
-        for late_ns in (0, 0, 0, 200_000_000, 30_000_000, 0, 100_000_000):
-            delay_next(rig.buses[0], servo.servo_id, late_ns)
-    rig.hardware.start()
-    assert rig.torque() == [True] * 8
-    assert [code for code, severity, *_ in rig.events.list if severity >= Severity.WARNING] == []
-    asked = [packet for packet in rig.into_bus() if packet[2] == 6]
-    assert asked.count(protocol1.ping(6)) == 3  # no servo was asked twice
 
 
 def test_first_states_that_a_standing_host_did_not_hear_are_read_again(monkeypatch):
@@ -166,15 +153,6 @@ def test_firmware_before_an_item_may_refuse_reads_of_it():
     assert "Homing Offset (20) = 5" in problem
     starts = {int.from_bytes(packet[8:10], "little") for packet in rig.into_bus() if packet[7] == 0x02}
     assert 60 not in starts
-
-
-def test_reading_registers_writes_nothing():
-    table, plan = find_table("XM430-W350"), make_x((11,))
-    rig = make_rig(plan)
-    wanted = [register_value(table, name, 900) for name in ("position_p_gain", "position_d_gain")]
-    (found,) = rig.lines.run_programs([read_registers(first_reach(plan, plan.servos[0]), wanted)])
-    assert found == {"position_p_gain": 800, "position_d_gain": 0}
-    assert rig.writes() == []
 
 
 def others(table):

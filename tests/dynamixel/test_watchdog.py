@@ -5,14 +5,12 @@ import math
 import pytest
 from msgspec.structs import replace
 from tests.kit.line_faults import delay_next, truncate_next
-from tests.kit.rigs import every_servo, make_rig, make_x, start_rig
+from tests.kit.rigs import make_rig, make_x, start_rig
 
 from dxlrun.channels.event_records import EventCode
 from dxlrun.dynamixel.servo import watchdog
 from dxlrun.dynamixel.servo.item_access import access_servo
 from dxlrun.dynamixel.servo.watchdog import RETURN_SPEED
-from dxlwire.bus_plan import RegisterValue
-from dxlwire.control_table import find_table
 from dxlwire.plan.bus_watchdog import UNIT_NS
 from dxlwire.transaction import Reply, TransactionOutcome
 from dxlwire.wire import protocol2
@@ -66,15 +64,6 @@ def fastest(rig, servo, count):
         rig.cycle()
         speeds.append(abs(servo.velocity))
     return max(speeds)
-
-
-def test_the_watchdog_is_armed_at_the_start_and_disarmed_at_the_end(started):
-    assert armed(started) == [10] * 4
-    started.cycles(50)
-    assert started.events.of(EventCode.WATCHDOG) == []
-    started.hardware.stop()
-    started.torque()
-    assert armed(started) == [0] * 4
 
 
 class TestWhileOthersAreArmed:
@@ -198,33 +187,6 @@ class TestLeftHolding:
         assert armed(rig) == [2] * 24
         assert self.leave(rig)[0] == []
         assert armed(rig) == [0] * 24
-
-
-def test_a_loop_that_was_silent_for_too_long_revives_the_servos_that_stopped(started):
-    for _ in range(2):  # a second time, too
-        started.cycles(5)
-        started.wait(300 * MS)
-        assert armed(started) == [TRIPPED] * 4
-        started.goals.position[:] = 0.2
-        started.cycles(100)
-        assert armed(started) == [10] * 4
-    assert started.states.position == pytest.approx(0.2, abs=0.01)
-    source, text = started.events.of(EventCode.WATCHDOG)[0]
-    assert source == "arm"
-    assert "the Bus Watchdog has stopped the servos" in text
-
-
-def test_a_ramp_that_the_watchdog_reset_is_written_again():
-    item = find_table("XM430-W350").items["profile_acceleration"]
-    rig = start_rig(every_servo(arm(), settings=(RegisterValue(item.address, item.size, 100, item.name),)))
-    rig.cycles(5)
-    rig.wait(300 * MS)
-    assert rig.registers(item.name) == [0] * 4
-    rig.cycles(100)
-    assert rig.registers(item.name) == [100] * 4
-    assert armed(rig) == [10] * 4
-    written = rig.events.texts(EventCode.REGISTER_WRITTEN)
-    assert written[-4:] == ["Profile Acceleration (108) was changed from 0 to 100"] * 4
 
 
 def test_a_servo_that_is_revived_goes_on_slowly_though_its_profile_was_reset(started):

@@ -43,7 +43,7 @@ from dxlsim.bus.simulated_bus import SimulatedBus
 from dxlsim.servo.simulated_servo import SimulatedServo
 from dxlsim.simulation_plan import AdapterConfig, BusConfig, ServoConfig
 from dxlsim.virtual_ports import VirtualPorts
-from dxlwire.bus_plan import BusPlan, ServoPlan
+from dxlwire.bus_plan import BusPlan
 from dxlwire.clock import VirtualClock
 from dxlwire.exchange.bus_engine import Lines
 from dxlwire.packets import PacketKind
@@ -126,7 +126,9 @@ class Rig:
         self.clock.wait_until(deadline)
 
     def anchor(self) -> None:
-        """Set the goals of joints that were given torque to where they are, as the loop does."""
+        """Set the goals of joints that got torque, or have none, to where they are, as the loop does."""
+        limp = np.isin(self.states.torque, (Torque.OFF, Torque.RELEASED)) & self.states.valid
+        np.copyto(self.goals.position, self.states.position, where=limp)
         given = (self.states.torque == Torque.GIVEN) & self.states.valid
         if given.any() and self.anchors:
             np.copyto(self.goals.position, self.states.position, where=given)
@@ -353,32 +355,3 @@ def random_fault(rig: Rig, chance: Random) -> None:
         lambda: servo.cut_power(now_ns + chance.randrange(150, 400) * 1_000_000),
     ]
     kinds[chance.randrange(5)]()
-
-
-def position_tick(servo: ServoPlan, position: float) -> int:
-    """Return the goal position of a joint angle, rad: the nearest that the joint's limits allow."""
-    theta = servo.direction * position + servo.reference
-    return min(max(round(theta / servo.rad_per_tick), servo.lower_tick), servo.upper_tick)
-
-
-def speed_tick(servo: ServoPlan, velocity: float) -> int:
-    """Return the moving speed of a speed, rad/s: its magnitude, rounded down.
-
-    NaN gives 0, the maximum in joint mode; 0 rad/s so gives 1 tick.
-    """
-    if math.isnan(velocity):
-        return 0
-    most = servo.max_speed_tick
-    return min(max(math.floor(min(abs(velocity) / servo.rad_s_per_tick + 1e-6, most)), 1), most)
-
-
-def goal_block(servo: ServoPlan, position: int, speed: int) -> bytes:
-    """Return the goal block of a servo in ticks; without a place for a speed, of the position alone."""
-    layout = servo.goal
-    block = bytearray(layout.length)
-    for place, value in ((layout.position, position), (layout.speed, speed)):
-        if place is not None:
-            signed = place.encoding == "twos_complement"
-            data = value.to_bytes(place.size, "little", signed=signed)
-            block[place.offset : place.offset + place.size] = data
-    return bytes(block)

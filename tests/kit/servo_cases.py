@@ -37,6 +37,7 @@ from tests.kit.line_faults import corrupt_next, delay_next, truncate_next, turn_
 from tests.kit.plans import make_plan
 from tests.kit.rigs import Rig, every_servo, make_rig, make_x
 
+from dxlrun.channels.cycle import Torque
 from dxlrun.errors import StartUpError, help_link
 from dxlsim.servo.simulated_servo import SimulatedServo
 from dxlsim.simulation_plan import ServoConfig
@@ -169,6 +170,8 @@ class Case:
                 later.append(partial(replace, port=value))
             elif option == "torque on return":
                 later.append(partial(every_servo, torque_on_return=True))
+            elif name == "limp":
+                later.append(partial(limp_at_start, int(value)))
             elif option == "taken over":
                 self.options["take_over"] = True
             elif name in {"firmware", "position"}:
@@ -255,6 +258,14 @@ def is_packet(protocol: float, packet: Sequence[str], value: bytes, data: bytes)
     return (data[4], data[7], data[8] | data[9] << 8) == expected and data[10:-2].startswith(value)
 
 
+def limp_at_start(servo_id: int, plan: BusPlan) -> BusPlan:
+    """Return a plan in which a servo gets no torque at the start."""
+    servos = [
+        replace(one, torque_at_start=one.torque_at_start and one.servo_id != servo_id) for one in plan.servos
+    ]
+    return replace(plan, servos=tuple(servos))
+
+
 def turn_beyond(case: Case, servo: SimulatedServo, ticks: str, side: str) -> None:
     plan = case.plan.servos[case.row(str(servo.servo_id))]
     tick = plan.upper_tick + int(ticks) if side == "above" else plan.lower_tick - int(ticks)
@@ -301,6 +312,7 @@ AFTER_START: dict[str, Callable[..., object]] = {
     r"torque (on|off) (\d+)": lambda case, on, servo_id: case.rig.hardware.switch_torque(
         case.row(servo_id), on == "on", case.answer
     ),
+    r"reboot (\d+)": lambda case, servo_id: case.rig.hardware.reboot_servo(case.row(servo_id), case.answer),
     r"register (\d+): (\w+) (-?\d+)": lambda case, servo_id, name, value: case.rig.hardware.write_register(
         case.row(servo_id), name, int(value), case.answer
     ),
@@ -337,6 +349,7 @@ CHANGES: dict[str, Callable[..., object]] = {
 EXPECTATIONS: dict[str, Callable[..., object]] = {
     r"torque: (.+)": lambda case, ids: case.expect_flags(case.rig.torque(), ids),
     r"valid: (.+)": lambda case, ids: case.expect_flags(case.rig.states.valid, ids),
+    r"released: (.+)": lambda case, ids: case.expect_flags(case.rig.states.torque == Torque.RELEASED, ids),
     r"goals: (.+)": lambda case, ids: case.expect_ids(case.rig.goals_sent()[-1][1], ids),
     r"servo (\d+): (.+)": Case.expect_registers,
     r"writes (\d+): (.+)": lambda case, servo_id, addresses: case.expect_ids(

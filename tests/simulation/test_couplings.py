@@ -11,7 +11,6 @@ import pytest
 from tests.kit.bodies import ARM, MASS, PULL, ROTOR, STEP_S, Turned, bodies_of, joint, link, run, urdf
 
 from dxlrun_mujoco.mujoco_plant import mujoco_plant
-from dxlsim.motion.control_law import ServoCommand
 from dxlsim.motion.coupled_joints import GIVE_RAD, CoupledJoints, joints_without_bodies
 from dxlsim.motion.mechanics import Mechanics, plant_of
 from dxlsim.motion.motor import Motor
@@ -194,17 +193,6 @@ def test_all_servos_of_one_simulation_move_as_if_each_coupling_were_alone():
     assert [*moved.angle] == [*pair.angle, *one.angle]
 
 
-def test_a_commanded_pair_goes_to_its_goal_together():
-    mechanics = Mechanics(0, without_bodies(on_one_axis(Load(0.05, gravity=0.5))))
-    motor = msgspec.structs.replace(RUBBING, damping=0.2)
-    for goal in (0.5, -0.5):
-        index = mechanics.add_servo(motor, NO_LOAD, 0.0)
-        mechanics.command_servo(index, ServoCommand(goal=goal, speed=1.0, p_ccw=8.0, p_cw=8.0, limit=1.0))
-    mechanics.step_to(3 * S)
-    assert mechanics.plant.angle == pytest.approx([0.5, -0.5], abs=0.05)
-    assert mechanics.still
-
-
 # The same in MuJoCo
 
 ARMS = urdf(link("a"), joint("pitch", "base", "a"), link("b"), joint("roll", "base", "b"))
@@ -250,24 +238,6 @@ def test_a_body_on_a_slide_is_held_by_its_weight():
     # it falls 0.01 m for each rad of the servo, whose rotor falls with it
     fall = MASS * 9.81 / (MASS + ROTOR.inertia / per_rad**2) * 0.3**2 / 2
     assert held.angle[0] - 0.5 == pytest.approx(-fall / per_rad, rel=0.02)
-
-
-@physics
-def test_a_slide_is_not_moved_by_a_joint_that_turns():
-    text = urdf(LIFT, link("b"), joint("x", "base", "b"))
-    moved = bodies(text, [Turned("lift", 0.5, 1.0), Turned("x", 0.0, 1.0)])
-    run(moved, 0.2, drive=[0.0, PULL], damping=0.2)
-    assert moved.angle[0] == 0.5
-
-
-@physics
-def test_two_servos_hold_a_body_together():
-    held = bodies(ARMS, [None, None], on_one_axis(name="pitch"))
-    run(held, 1.0, drive=[0.7 * PULL, -0.3 * PULL], damping=0.3)
-    assert held.angle == pytest.approx([0.0, 0.0], abs=2e-3)
-    run(held, 0.3, drive=[0.5 * PULL, -0.3 * PULL], damping=0.3)
-    assert held.angle[0] < -0.02
-    assert held.angle[0] == pytest.approx(-held.angle[1], abs=2e-3)
 
 
 @physics

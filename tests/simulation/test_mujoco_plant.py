@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -86,16 +85,6 @@ def test_an_arm_is_held_by_its_weight_times_its_lever(reference, direction, angl
     assert plant.angle[0] > servo_angle + 0.01, "a positive torque turns a servo counter-clockwise"
 
 
-@physics
-def test_friction_holds_what_it_can_hold():
-    holding = plant_of(ONE, load=Load(friction=1.1 * PULL))
-    run(holding, 10.0)
-    assert holding.angle[0] == pytest.approx(0.0, abs=0.002)
-    slipping = plant_of(ONE, load=Load(friction=0.9 * PULL))
-    run(slipping, 2.0)
-    assert slipping.angle[0] < -0.05
-
-
 @pytest.mark.parametrize("bodies", [pytest.param(True, id="bodies", marks=physics), False])
 @pytest.mark.parametrize(("pulled", "falls"), [(0.25, False), (0.35, True)])
 def test_friction_of_the_gear_grows_with_what_pulls_at_it(pulled, falls, bodies):
@@ -149,23 +138,6 @@ def test_a_joint_with_a_servo_of_its_own_mimics_no_joint():
 
 
 @physics
-def test_a_servo_that_is_added_later_moves_alone():
-    make = mujoco_plant(bodies_of(ONE, (SHOULDER,)))
-    assert len(make(()).angle) == 0
-    assert is_held(make([PlantJoint(ROTOR, NO_LOAD, 0.0), PlantJoint(ROTOR, NO_LOAD, 2.0)]), [PULL, 0.0])
-
-
-@physics
-def test_a_joint_is_placed_at_rest():
-    plant = plant_of(ONE)
-    run(plant, 0.2)
-    assert plant.velocity[0] < -1
-    plant.place_shaft(0, -math.pi / 2)
-    run(plant, 1.0)
-    assert plant.angle[0] == pytest.approx(-math.pi / 2, abs=1e-9)
-
-
-@physics
 def test_two_runs_are_the_same_to_the_last_bit():
     runs = []
     for _ in range(2):
@@ -194,14 +166,6 @@ def test_a_link_that_only_has_a_shape_weighs_as_water_does():
     box = '<collision><origin xyz="0.1 0 0"/><geometry><box size="0.1 0.1 0.05"/></geometry></collision>'
     plant = plant_of(urdf(f'<link name="arm">{box}</link>', joint("shoulder", "base", "arm")))
     assert is_held(plant, 1000 * 0.1 * 0.1 * 0.05 * 9.81 * 0.1)
-
-
-@physics
-def test_the_torso_moves():
-    text = (Path(__file__).parents[2] / "robots" / "urdf/bioloid_torso.urdf").read_text("utf-8")
-    plant = plant_of(text, Turned("left_shoulder_swing_joint", 1.0, -1), Turned("head_yaw_joint", 2.6, 1))
-    run(plant, 0.5, drive=[0.0, 0.0], damping=0.01)
-    assert np.isfinite(plant.angle).all()
 
 
 NAMES = "hinges of the URDF and joints of the robot file have different names; use"

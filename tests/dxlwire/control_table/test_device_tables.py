@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-import struct
 import tomllib
 from pathlib import Path
 
@@ -27,21 +26,6 @@ BOARD = read_head(TEXT)
 @pytest.fixture(autouse=True)
 def _no_added_tables(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(device_models, "_ADDED", [])
-
-
-def test_items_have_units_offsets_bits_and_floats() -> None:
-    items = read_device_table(BOARD).items
-    assert items["pressure"].value((300).to_bytes(2, "little")) == pytest.approx(2.0 - 0.03)
-    assert [items[name].value(bytes((0b1001,))) for name in ("start", "stop")] == [1.0, 1.0]
-    assert [items[name].value(bytes((0b0110,))) for name in ("start", "stop")] == [0.0, 0.0]
-    assert [items[name].value(bytes((0b1000,))) for name in ("start", "stop")] == [0.0, 1.0]
-    assert items["yaw"].value(struct.pack("<f", -1.25)) == -1.25
-    assert [item.state for item in items.values()][4:] == [
-        "button.start",
-        "button.stop",
-        "force.z",
-        "orientation.z",
-    ]
 
 
 def test_a_table_without_a_model_number_is_one_that_is_not_checked() -> None:

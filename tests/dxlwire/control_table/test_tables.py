@@ -5,8 +5,6 @@ import re
 from fractions import Fraction
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from dxlwire.control_table import (
     CAPABILITIES,
@@ -33,13 +31,6 @@ every_table = pytest.mark.parametrize("table", TABLES, ids=_id)
 
 def test_the_models_of_protocol_1_are_all_there() -> None:
     assert {table.model: table.model_number for table in TABLES if table.protocol == 1.0} == PROTOCOL1
-
-
-@every_table
-def test_no_two_items_share_a_byte(table: ControlTable) -> None:
-    cells = [cell for item in table.items.values() for cell in range(item.address, item.address + item.size)]
-    assert len(cells) == len(set(cells))
-    assert max(cells) + 1 == table.size
 
 
 @every_table
@@ -173,40 +164,6 @@ def test_units_by_examples_of_the_manual(
     model: str, protocol: float, item: str, tick: int, si: float
 ) -> None:
     assert find_table(model, protocol).items[item].scale * tick == pytest.approx(si, rel=1e-3)
-
-
-def test_the_block_of_an_x_servo_is_that_of_the_manual() -> None:
-    table = find_table("XM430-W350")
-    assert (table.effort_item, table.present_speed_item) == ("present_current", "present_velocity")
-    assert [table.items[name].address for name in (table.effort_item, table.present_speed_item)] == [126, 128]
-    assert table.items["present_position"].address == 132
-    assert [table.items[name].address for name in (table.goal_speed_item, "goal_position")] == [112, 116]
-    assert {"sync_read", "posvel", "state_block", "operating_mode", "hardware_error"} <= table.capabilities
-    assert table.items["shutdown"].area == "EEPROM"
-    assert table.items["torque_enable"].address == 64
-
-
-def test_indirect_items_are_numbered_through_both_blocks() -> None:
-    items = find_table("XM430-W350").items
-    assert [items[f"indirect_address_{number}"].address for number in (1, 28, 29, 56)] == [168, 222, 578, 632]
-    assert [items[f"indirect_data_{number}"].address for number in (1, 28, 29, 56)] == [224, 251, 634, 661]
-    assert [items[f"indirect_address_{number}"].initial for number in (1, 28, 29, 56)] == [224, 251, 634, 661]
-    last = find_table("PH54-200-S500").items["indirect_address_128"]
-    assert (last.address, last.initial, last.area) == (422, 761, "EEPROM")
-
-
-def test_present_position_may_leave_the_turn_but_the_goal_may_not() -> None:
-    items = find_table("XM430-W350").items
-    assert items["present_position"].minimum == -(2**31)
-    assert (items["goal_position"].minimum, items["goal_position"].maximum) == (0, 4095)
-
-
-@given(st.sampled_from(TABLES), st.data())
-def test_every_item_of_every_model_decodes_what_it_encodes(table: ControlTable, data: st.DataObject) -> None:
-    item = table.items[data.draw(st.sampled_from(sorted(table.items)))]
-    low, high = (-1023, 1023) if item.encoding == "sign_magnitude" else (item.minimum, item.maximum)
-    ticks = data.draw(st.integers(low, high))
-    assert item.decode(item.encode(ticks)) == ticks
 
 
 @every_table
