@@ -41,7 +41,7 @@ buses:
     baud_rate: 1_000_000
     return_delay_time: 100 us
     adapter: {latency: 1 ms}
-loop: {rate: 50, scheduler: {policy: round_robin, priority: 31}}
+loop: {rate: 50, tolerated_skips: 100 %, scheduler: {policy: round_robin, priority: 31}}
 joints:
   pan: {bus: main, id: 3, model: AX-12A, reference: 150 deg, direction: 1}
   tilt: {bus: main, id: 7, model: AX-12A, reference: 150 deg, direction: -1}

@@ -620,21 +620,25 @@ class HangingGuardian:
 
 
 @pytest.mark.parametrize(
-    ("signals", "phase", "least_s", "most_s"),
+    ("signals", "loop_exited", "phase", "least_s", "most_s"),
     [
-        (2, Phase.RUNNING, 0.1, 0.5),
-        (2, Phase.ENGAGING, 0.1, 0.5),
-        (1, Phase.RUNNING, 5.0, 5.5),
-        (2, Phase.LOADING, 5.0, 5.5),
+        (2, False, Phase.RUNNING, 0.1, 0.5),
+        (2, False, Phase.ENGAGING, 0.1, 0.5),
+        (0, True, Phase.RUNNING, 0.1, 0.5),
+        (1, False, Phase.RUNNING, 5.0, 5.5),
+        (2, False, Phase.LOADING, 5.0, 5.5),
     ],
 )
 def test_a_supervisor_waits_for_a_guardian_only_shortly_once_torque_is_to_be_cut(  # noqa: PLR0917  fixtures
-    plan, monkeypatch, signals, phase, least_s, most_s
+    plan, monkeypatch, signals, loop_exited, phase, least_s, most_s
 ):
     memory = create_memory(plan)
     Heartbeat(memory.heartbeat).enter_phase(phase)
     run = supervisor._Run(plan, RunOptions(gateway=False), memory, Console(file=io.StringIO()))
     run.signals = signals
+    if loop_exited:
+        with subprocess.Popen(["/bin/true"]) as loop:
+            run.loop = os.pidfd_open(loop.pid)
     guardian = HangingGuardian(os.getpid())
     monkeypatch.setattr(supervisor, "time", SimpleNamespace(monotonic_ns=lambda: guardian.now_ns))
     run.watch_guardian(guardian, lambda heartbeat: None)  # type: ignore[arg-type]  # what stands for the guardian
@@ -642,6 +646,8 @@ def test_a_supervisor_waits_for_a_guardian_only_shortly_once_torque_is_to_be_cut
     assert run.sentences == ["the guardian stopped watching the loop and was killed"]
     guardian.channel.close()
     guardian.theirs.close()
+    if run.loop is not None:
+        os.close(run.loop)
 
 
 def test_waits_for_simulated_servos_are_reported_once_a_second() -> None:

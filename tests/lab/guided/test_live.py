@@ -271,7 +271,9 @@ def test_without_a_yes_no_run_is_started(place, monkeypatch, capsys, answer):
         if answer:
             os.write(ours, answer)
         elif answer is not None:
-            threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()
+            # the signal comes when the command waits for an answer
+            waits = SimpleNamespace(select=lambda *_: (signal.raise_signal(signal.SIGINT), ([], [], []))[1])
+            monkeypatch.setattr(on_robot, "select", waits)
         words, options = ["pair.yaml", "tilt"], ExperimentOptions(range=("tilt=-15deg..15deg",))
         if answer is None:
             with pytest.raises(InputError, match="their motion cannot be confirmed without a terminal"):
