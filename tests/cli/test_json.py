@@ -13,6 +13,8 @@ from dxlrun.cli.app import build
 from dxlrun.cli.verb_registry import GROUPS
 from dxlrun.testing import simulated_robot
 
+pytestmark = pytest.mark.long
+
 ROOT = Path(__file__).parents[2]
 Dxlrun = Callable[..., Any]
 SUCCESSFUL = {

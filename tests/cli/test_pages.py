@@ -39,6 +39,8 @@ from dxlsim.messages import SimulationJob, SimulationMessage
 from dxlsim.simulation_plan import BusConfig, DeviceConfig, ServoConfig, SimulationConfig
 from dxlwire.control_table import find_table
 
+pytestmark = pytest.mark.long
+
 ROOT = Path(__file__).parents[2]
 NEW = ("--protocol", "2.0", "--baud", "1000000")
 ROBOT = """\

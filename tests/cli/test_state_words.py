@@ -6,7 +6,11 @@ import json
 import re
 from pathlib import Path
 
+import pytest
+
 from dxlrun.channels.cycle import Torque
+
+pytestmark = pytest.mark.long
 
 ROOT = Path(__file__).parents[2]
 

@@ -28,6 +28,8 @@ from dxlwire.control_table import (
 from dxlwire.control_table.deviation import UNDESCRIBED, Deviation, deviation_of, deviations_by_name
 from dxlwire.plan.planning import Wiring, bus_plan, position_layout
 
+pytestmark = pytest.mark.long
+
 TABLES = all_tables()
 ADDRESSES = {"id", "baud_rate", "baud_rate_bus", "protocol_type"}
 """With another value of these a servo does not answer at its place at all."""

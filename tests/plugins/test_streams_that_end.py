@@ -24,6 +24,8 @@ from dxlrun.log.log_reader import LogReader, open_log
 from dxlrun.testing import simulated_robot
 from dxlrun_controllers.plugin import dxlrun_controllers
 
+pytestmark = pytest.mark.long
+
 ROBOTS = Path(__file__).parents[2] / "robots"
 JOINTS = ("shoulder", "elbow")
 RATE, PERIOD_S = 50, 0.02

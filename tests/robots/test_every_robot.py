@@ -12,6 +12,8 @@ from tests.kit.examples import as_parameters
 from dxlrun.compile.robot_compiler import compile_files
 from dxlwire.joint_unit import LINEAR
 
+pytestmark = pytest.mark.long
+
 ROBOTS = Path(__file__).parents[2] / "robots"
 MOTIONS = sorted(ROBOTS.glob("motions/*.yaml"))
 LONGEST_S = 4.0

@@ -18,6 +18,8 @@ from dxlsim.faults.fault import parse_fault
 from dxlsim.faults.script import FaultScript
 from dxlsim.simulation_plan import AdapterConfig
 
+pytestmark = pytest.mark.long
+
 ROBOTS = Path(__file__).parents[2] / "robots"
 TORSO = ROBOTS / "bioloid_torso.yaml"
 STARTED_NS = 1_000_000_000

@@ -26,6 +26,8 @@ from dxlrun.log.log_reader import read_log
 from dxlrun.testing import VirtualRobot, simulated_robot
 from dxlsim.faults.kinds import KINDS
 
+pytestmark = pytest.mark.long
+
 ROBOTS = Path(__file__).parents[2] / "robots"
 TORSO = ROBOTS / "bioloid_torso.yaml", ROBOTS / "motions/three_parts.yaml"
 LIMITS = ", limits: {position: [-1.2 rad, 1.2 rad], velocity: 4 rad/s}"

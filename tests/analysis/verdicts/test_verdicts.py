@@ -14,6 +14,8 @@ import pytest
 from tests.analysis.verdicts.cases import Case, read_cases
 from tests.kit.campaigns import campaign
 
+pytestmark = pytest.mark.long
+
 HERE = Path(__file__).parent
 CASES = [*read_cases(*sorted({*HERE.glob("*.txt")} - {HERE / "losses.txt"}))]
 PAIRS = [(case, robot) for case in CASES for robot in case.robots]
