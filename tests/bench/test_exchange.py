@@ -5,21 +5,15 @@ How fast a host is decides nothing here.
 
 from __future__ import annotations
 
-import os
-import select
-
 import numpy as np
 import pytest
-from tests.kit.awaited import DEADLINE_S
 
 from dxlrun.errors import ProcessFault
 from dxlrun_lab.late_servos import LedgerTransaction
-from dxlwire.wire import protocol1
-from exchange.bus import Settings, bench_bus, chosen_hosts, to_json
+from exchange.bus import Settings, bench_bus, chosen_hosts
 from exchange.canned import CannedResponder
 from exchange.case import Case, Registers
-from exchange.hosts import HOSTS, HostKind
-from exchange.responder import Terminal
+from exchange.hosts import HOSTS
 from exchange.rounds import measure
 from exchange.wire import judge
 
@@ -60,58 +54,6 @@ def test_on_simulated_servos_the_ledger_says_how_many_bytes_an_exchange_has():
     assert (found.against, found.baud_rate) == ("simulated", 1_000_000)
     assert ours.sent_bytes + ours.received_bytes == budget.request_bytes + budget.reply_bytes
     assert ours.wire.wire_us == budget.wire_ns / 1e3
-
-
-def test_a_host_that_is_not_installed_is_left_out_and_the_core_is_given_back():
-    cores = os.sched_getaffinity(0)
-    absent_host = HostKind("absent", "no_such_module_at_all", HOSTS[0].make)
-    reported: list[tuple[str, float]] = []
-    settings = Settings([absent_host, *chosen_hosts(["unrecorded"])], 0.05)
-    found = bench_bus([("canned", Case(2.0, 1))], settings, lambda *words: reported.append(words))
-    assert found.missing == ("absent",)
-    assert [one.host for one in found.cases[0].hosts] == ["unrecorded"]
-    assert reported[-1] == ("canned: Protocol 2.0, 1 x XM430-W350", 1.0)
-    assert b'"exchanges"' in to_json(found)
-    assert os.sched_getaffinity(0) == cores
-
-
-def test_the_responder_answers_after_so_many_bytes_and_is_a_servo_again_when_rehearsed():
-    """It learns to answer a ping, then goals without a reply."""
-    terminal = Terminal(Case(1.0, 1).simulated("main"))
-    host = os.open(terminal.path, os.O_RDWR | os.O_NOCTTY)
-
-    def say(data: bytes, size: int = 0) -> bytes:
-        """Write, let the responder take all of it, and hear an answer of some size."""
-        left, heard = os.write(host, data), b""
-        while left > 0:
-            assert select.select([terminal], [], [], DEADLINE_S)[0]
-            left -= terminal.receive()
-        while len(heard) < size:
-            assert select.select([host], [], [], DEADLINE_S)[0], f"only {heard.hex(' ')} came"
-            heard += os.read(host, 1000)
-        assert not select.select([host], [], [], 0)[0]
-        return heard
-
-    terminal.do("rehearse")
-    assert say(protocol1.ping(1), 6)[2] == 1
-    terminal.do("learn")
-    assert say(protocol1.ping(1), 6)
-    assert say(protocol1.write_range(0xFE, 30, b"\0\2")) == b""
-    (first, last) = terminal.do("play")
-    assert (first.count, len(first.reply)) == (6, 6)
-    assert (last.count, last.reply) == (9, b"")
-    assert say(b"12345") == b"", "bytes count, whatever they are"
-    answer = say(b"6", 6)
-    assert answer[2] == 1
-    assert say(b"123456789") == b""
-    assert say(b"123456", 6) == answer
-    assert say(b"123456789") == b""
-    assert len(say(b"?" * (6 + 9 + 6), 12)) == 12, "what comes together is answered together"
-    assert say(b"123456789123") == b""
-    terminal.do("rehearse")
-    assert say(protocol1.ping(7)) == b""
-    assert say(protocol1.ping(1), 6)[2] == 1
-    os.close(host)
 
 
 def test_a_responder_that_ended_is_an_error_and_is_not_waited_for():

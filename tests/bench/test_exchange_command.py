@@ -40,14 +40,6 @@ def test_a_wrong_word_is_refused_and_nothing_is_measured(
     assert printed.out == ""
 
 
-def test_the_exchange_is_shown_in_a_table(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([*FEW, "--peers", "unrecorded,rustypot"]) == 0
-    head, _, first, second = capsys.readouterr().out.splitlines()
-    assert head.split()[:4] == ["against", "protocol", "servos", "host"]
-    assert first.split()[:6] == ["canned", "2.0", "1", "x", "XM430-W350", "unrecorded"]
-    assert "of it" in second
-
-
 def test_the_folder_is_run_as_a_program_from_anywhere_and_prints_json(tmp_path: Path) -> None:
     words = (*FEW, "--peers", "unrecorded", "--json")
     ran = subprocess.run(

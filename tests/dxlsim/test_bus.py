@@ -74,17 +74,6 @@ def test_an_instruction_waits_for_the_bytes_before_it():
     assert bus.next_due_ns() == 1_000_000 + PONG_ENDS
 
 
-def test_what_is_read_is_the_state_when_the_instruction_arrived():
-    bus = new_bus(delay_ns=0)
-    bus.receive_bytes(packet1(1, 3, 30, 255, 3), 0)  # goal 1023
-    bus.drain_bytes(1_000_000)
-    positions = []
-    for at_ns in (200_000_000, 400_000_000):
-        bus.receive_bytes(READ_1, at_ns)
-        positions.append(int.from_bytes(bus.drain_bytes(LATER)[5:7], "little"))
-    assert positions[0] < positions[1]
-
-
 @pytest.mark.parametrize(("split", "received"), [("whole", "ff ff"), ("byte", "ff ff")])
 def test_who_talks_into_a_reply_loses_both(split, received):
     bus = new_bus(AdapterConfig(split=split))

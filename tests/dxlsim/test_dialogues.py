@@ -45,7 +45,6 @@ ERRORS = {
           "cells": 7, "read-only": 7, "alert": 0x80},
 }  # fmt: skip
 """e-Manual, Protocol 1.0 and 2.0, section "Error"."""
-SETTINGS = {"delay_us": ("return_delay_ns", 1000), "write_ms": ("write_time_ns", 1_000_000)}
 COMMENT = re.compile(r"\s+#( .*|$)")
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
 
@@ -105,8 +104,10 @@ class Dialogue:
             load = Load(load.inertia, load.friction, float(pull), float(angle))
         settings: dict[str, Any] = {"load": load}
         for key, value in given.items():
-            name, factor = SETTINGS.get(key, (key, 1))
-            settings[name] = float(value) if key == "position" else int(value) * factor
+            if key == "delay_us":
+                settings["return_delay_ns"] = int(value) * 1000
+            else:
+                settings[key] = float(value) if key == "position" else int(value)
         if model.endswith("(2.0)"):
             settings["protocol"] = 2.0
         ids = [int(word) for word in words if "=" not in word]

@@ -17,7 +17,6 @@ from msgspec import structs
 from dxlsim.motion.mechanics import Mechanics
 from dxlsim.motion.motor import motor_of
 from dxlsim.motion.plant import IndependentJoints, PlantJoint
-from dxlsim.motion.shaft import critical_d
 from dxlsim.motor_model import MotorModel, Stribeck
 from dxlsim.servo.making import make_servo
 from dxlsim.servo.simulated_servo import SimulatedServo
@@ -180,15 +179,6 @@ def test_a_servo_with_a_motor_file_is_that_motor(model, parameters):
     assert stribeck is None or off(structs.replace(motor, stribeck=None))[1] > 3 * end
 
 
-@both
-@four
-def test_top_speeds_are_within_10_percent_of_the_identified_servo(model, parameters):
-    servo, mechanics = simulated(model)
-    angles, _ = move(servo, mechanics, START + 3.5, 1.0)
-    expected = np.diff(reference(parameters[model], BENCH[model], 3.5, 1.0)).max() / 2e-4
-    assert np.diff(angles).max() / 2e-3 == pytest.approx(expected, rel=0.10)
-
-
 @four
 @pytest.mark.parametrize("direction", [1, -1])
 def test_it_comes_to_rest_as_far_from_its_goal_as_real_ones_do(model, direction):
@@ -245,14 +235,6 @@ def test_a_model_is_scaled_from_the_identified_motor_of_its_kind(like, models):
         assert tables
         for table in tables:
             assert motor_of(table).source.startswith(f"[i] scaled from the {like}: "), model
-
-
-@pytest.mark.parametrize("p", [5.06, 20.0])
-def test_the_gain_that_does_not_overshoot_is_the_critical_one(p):
-    motor = motor_of(find_table("XM430-W350"))
-    speed = motor.stall_torque / motor.damping
-    # T x'' + (1 + D w) x' + P w x = 0 has one root twice
-    assert (1 + critical_d(p, motor) * speed) ** 2 == pytest.approx(4 * motor.time_constant * p * speed)
 
 
 @pytest.mark.parametrize(("model", "protocol"), [("MX-64", 1.0), ("MX-106", 1.0), ("XL330-M288", 2.0)])

@@ -62,14 +62,6 @@ def test_waking_by_a_goal_can_be_switched_off():
     assert line.get("present_position") == pytest.approx(700, abs=2)
 
 
-def test_position_of_a_wheel_stays_in_its_range():
-    line = Line()
-    line.put(cw_angle_limit=0, ccw_angle_limit=0, torque_enable=1, moving_speed=1023)
-    seen = {line.get("present_position") for _ in range(200)}
-    assert (min(seen), max(seen)) == (0, 1023)
-    assert len(seen) > 50
-
-
 @pytest.mark.parametrize(
     ("model", "firmware", "backs_up", "reads_fast"),
     [

@@ -50,16 +50,6 @@ def test_a_servo_acts_a_response_delay_later_and_then_as_ever(model, goal, delay
     assert quick[grid]
 
 
-@pytest.mark.parametrize("after_ms", [0.1, 1.0, 1.9])
-def test_a_goal_between_two_points_of_the_grid_acts_at_the_next_one(after_ms):
-    bus = bus_of("XM430-W350")
-    bus.advance_to(round((10 + after_ms) * MS))
-    moved = way(bus, 3000, 10 * MS)
-    ends = round((4.0 - after_ms) * 10)  # 0.1 ms until the end of the first step that begins after the goal
-    assert not any(moved[: ends - 1])
-    assert moved[ends + 1] > 0.0
-
-
 @pytest.mark.parametrize(
     ("model", "item"),
     [

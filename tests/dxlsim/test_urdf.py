@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 import pytest
@@ -108,12 +107,3 @@ def test_a_comment_does_not_hide_a_doctype() -> None:
 
     assert (caught.value.problems[0].mark.line, caught.value.problems[0].mark.column) == (2, 2)
     assert read_urdf("<!-- <!DOCTYPE --><robot><link name='a'/></robot>").root == "a"
-
-
-def test_the_torso_has_the_tree_of_the_thesis() -> None:
-    urdf = read_urdf((Path(__file__).parents[2] / "robots" / "urdf/bioloid_torso.urdf").read_text())
-
-    assert urdf.links[:4] == ("world", "odom", "imu", "base_link")
-    turning = [joint for joint in urdf.joints if joint.moves]
-    assert len(turning) == 8
-    assert all(math.hypot(*joint.axis) == 1.0 for joint in turning)

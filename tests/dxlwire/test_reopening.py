@@ -7,7 +7,6 @@ import pytest
 from tests.kit.awaited import DEADLINE_S
 
 from dxlwire.exceptions import PortError
-from dxlwire.port.ports import SerialPort, SerialPorts
 from dxlwire.port.reopening import KeptLines, LineSettings, lasting_name
 
 
@@ -102,23 +101,6 @@ def test_of_two_lines_of_which_one_is_missing_neither_is_kept(adapters):
     with pytest.raises(PortError, match="port /dev/ttyNOPE not found"):
         KeptLines([LineSettings(left, 1_000_000, 0), LineSettings("/dev/ttyNOPE", 1_000_000, 0)])
     KeptLines([LineSettings(left, 1_000_000, 0)]).close()
-
-
-def test_reopened_line_takes_the_place_of_the_lost_one(adapters, kept):
-    back = []
-    ports = SerialPorts(
-        [SerialPort(os.dup(one), "a line") for one in kept.descriptors],
-        lambda _: back.pop() if back else None,
-    )
-    adapters[0].unplug()
-    assert not ports.reopen(0)
-    kept.lost(0)
-    adapters[0].plug_in()
-    assert returned(kept) == [0]
-    back.append(os.dup(kept.descriptors[0]))
-    assert ports.reopen(0)
-    ports.ports[0].write_packet(b"again")
-    assert adapters[0].heard() == b"again"
 
 
 def test_the_name_by_which_an_adapter_is_found_again(tmp_path):

@@ -1,10 +1,7 @@
 """Servo tool: what `dxlrun servo` does to one servo; `tool_cases/*.txt` has most of it."""
 
-from functools import partial
-
 import pytest
 from tests.kit.cases import case_parameters
-from tests.kit.line_faults import delay_next
 from tests.kit.plans import distinct_tables
 from tests.kit.servo_cases import CASES
 from tests.kit.tool_cases import RATE, WRITE, ToolCase, ToolRig
@@ -81,60 +78,3 @@ def test_the_backup_of_every_model_fits_that_model_and_heals_it(tmp_path, protoc
         rig.one.write_registers(wanted)
         assert rig.sent().count(WRITE) == len(changed)
         assert all(rig.servo(1).registers[each.name] == each.value for each in changed)
-
-
-@pytest.mark.parametrize(
-    ("model", "limit"), [("XM430-W350", "max_position_limit"), ("AX-12A", "ccw_angle_limit")]
-)
-@pytest.mark.parametrize("late_ms", [200, 270, 300, 400, 520])
-def test_a_value_that_comes_late_is_not_shown_for_the_next_register(model, limit, late_ms):
-    """The host stalls again and again: what it then hears was asked before."""
-    rig = ToolRig(model)
-    names = [limit, "present_position"]  # of one length
-    true = [rig.one.read_items([name])[name] for name in names]
-    assert true[0] != true[1]
-    for _ in range(40):
-        delay_next(rig.line.bus, 1, late_ms * 1_000_000)
-    shown = []
-    for name in names * 3:
-        try:
-            shown.append(rig.one.read_items([name])[name])
-        except ServoFault:
-            shown.append(None)
-    assert all(value in {None, right} for value, right in zip(shown, true * 3, strict=True)), shown
-    assert None not in shown or late_ms > 250
-    assert rig.one.found.garbled is False
-
-
-TRUE = {"id": 1, "operating_mode": 3, "temperature_limit": 80, "shutdown": 52, "led": 0}
-
-
-@pytest.mark.parametrize("at", [0, 1, 3])
-@pytest.mark.parametrize(
-    ("late_ms", "copies"),
-    # a burst of copies behind the timeout of a tool and its drain, 0.75 s, may meet a later request
-    [
-        *((late, copies) for late in (0, 20, 250, 600) for copies in (1, 2, 5, 40)),
-        (900, 1),
-        (900, 2),
-        (1500, 2),
-    ],
-)
-def test_what_is_read_is_never_the_reply_to_an_earlier_request(rig, at, late_ms, copies):
-    """Replies of equal length that come late, or several times; a status does not carry what it answers."""
-    disturb = partial(
-        rig.line.bus.alter_next, 1, "disturbed", bytes, delay_ns=late_ms * 1_000_000, copies=copies
-    )
-    if at:
-        rig.line.bus.after(at, disturb)
-    else:
-        disturb()
-    found = {}
-    for name in (*TRUE, *TRUE):
-        try:
-            found = rig.one.read_items([name])
-        except ServoFault:  # said, and nothing is shown
-            continue
-        assert found == {name: TRUE[name]}
-    assert found
-    assert rig.one.read_items(list(TRUE)) == TRUE

@@ -198,16 +198,6 @@ def test_a_speed_that_is_harmless_is_written_with_each_goal(table):
             assert layout.address <= item.address < layout.address + layout.length, name
 
 
-def test_a_servo_that_refuses_to_read_between_its_items_is_read_without_what_is_between():
-    """Of tables of Protocol 2.0 it is not known which servos do [?]."""
-    bench = Bench(find_table("XM430-W350"))
-    memory, table = bench.servo.registers, bench.one.table
-    read = memory.read_bytes
-    memory.read_bytes = lambda start, size: read(start, size) if table.readable(start, start + size) else None
-    (problem,), _ = bench.inspect(secondary_shadow_id=2)
-    assert "Secondary (Shadow) ID (12) = 2" in problem
-
-
 @pytest.mark.parametrize(("model", "protocol", "reads"), [("XM430-W350", 2.0, 3), ("AX-12A", 1.0, 2)])
 def test_inspection_reads_identity_and_each_area_once(model, protocol, reads):
     bench = Bench(find_table(model, protocol))

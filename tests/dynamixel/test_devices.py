@@ -158,38 +158,6 @@ def test_a_lost_device_costs_the_servos_nothing(fast, capabilities):
     assert rig.events.of(EventCode.SERVO_LOST) == []
 
 
-def test_a_single_lost_reply_of_a_device_is_reported_once_and_it_is_back_in_a_moment():
-    rig = started(("speed",), ("speed",))
-    rig.cycles(5)
-    device(rig).silence()
-    rig.cycle()
-    assert rig.sources.valid.tolist() == [False, False]  # it may silence the one behind it
-    device(rig).silence(on=False)
-    rig.cycle()
-    rig.cycle()
-    assert rig.sources.valid.all()
-    assert rig.events.sources(EventCode.READ_LOST) == ["device_0"]
-    assert rig.events.of(EventCode.READ_BACK) == [
-        ("device_0", "device_0 (ID 101 on bus main) answers again; 2 replies in a row were lost")
-    ]
-
-
-def test_a_device_is_found_again_on_a_bus_without_idle_time_for_it():
-    rig = started(("speed",), ("speed",), period_ns=2_000_000)
-    for cycle in range(120):
-        if cycle in {10, 11}:
-            device(rig).silence(on=cycle == 10)
-        until_ns = rig.clock.now_ns() + rig.period_ns
-        rig.hardware.read_states()
-        rig.hardware.write_goals()
-        rig.hardware.idle(until_ns)
-        rig.clock.wait_until(until_ns)  # or later: what is asked of the device may skip a period
-        assert rig.states.valid.all()
-    assert rig.sources.valid.all()
-    (text,) = rig.events.texts(EventCode.OVERRUN)
-    assert text.startswith("the return of device_0 (ID 101 on bus main) needs up to ")
-
-
 @pytest.mark.parametrize("fast", [True, False])
 def test_a_device_that_answers_only_alone_is_read_alone(monkeypatch, fast):
     rig = started(("speed",), ("speed",), fast=fast)
@@ -217,30 +185,6 @@ def test_a_device_that_answers_only_between_the_cycles_is_asked_seldom(monkeypat
     (lost, *_) = rig.events.of(EventCode.DEVICE_LOST)
     assert "answers single reads, but not those of the cycles" in lost[1]
     assert len(rig.events.of(EventCode.DEVICE_LOST)) <= 3
-
-
-@pytest.mark.parametrize(
-    ("late_us", "capabilities"), [(900, ALL), (4000, ALL), (18_500, NONE), (19_500, NONE), (39_000, NONE)]
-)
-def test_a_late_reply_is_never_taken_for_a_new_one(late_us, capabilities):
-    rig = started(("speed",), ("speed",), capabilities=capabilities)
-    valid = silent = 0
-    for cycle in range(80):
-        if cycle == 10:
-            device(rig).reply_later(late_us * 1000)
-        if cycle == 50:
-            device(rig).reply_later(0)
-        poke(rig, "profile_velocity", cycle, 0)
-        poke(rig, "profile_velocity", 1000 + cycle, 1)
-        rig.cycle()
-        silent += not rig.states.valid.all()
-        for row, value in enumerate((cycle, 1000 + cycle)):
-            if rig.sources.valid[row]:
-                assert rig.sources.values[row] == value
-        valid += rig.sources.valid[0]
-    assert valid >= 20 + 60 * (late_us <= 900)
-    assert silent <= 2  # it may talk at the same time as servos
-    assert rig.sources.valid[1]
 
 
 def test_a_number_that_is_none_is_not_believed():

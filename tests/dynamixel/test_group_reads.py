@@ -103,17 +103,6 @@ def test_servos_of_old_firmware_are_read_plainly_and_it_is_reported():
     assert "2.76 ms instead of 2.28 ms (at most 362 Hz)" in text
 
 
-def test_models_of_two_layouts_are_read_by_one_fast_bulk_read():
-    models = ["XM430-W350"] * 3 + ["PM42-010-S260"] * 3
-    plan = make_x((11, 12, 13, 21, 22, 23), models=models, reference=0.0, lower=-3.1, upper=3.1, fast=True)
-    rig = start_rig(plan)
-    since = len(rig.ledger.entries)
-    rig.cycle()
-    requests = [(one, 126, 10) for one in (11, 12, 13)] + [(one, 574, 10) for one in (21, 22, 23)]
-    assert rig.ledger.entries[since].data == protocol2.bulk_read(requests, fast=True)
-    assert rig.states.valid.all()
-
-
 def test_who_has_no_fast_form_is_read_beside_those_who_have_one():
     models = ["XM430-W350"] * 4 + ["2XL430-W250"] * 2
     plan = make_x((1, 2, 3, 4, 5, 6), models=models, return_delay_ns=100_000, fast=True)

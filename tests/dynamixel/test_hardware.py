@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from tests.kit.line_faults import corrupt_next, delay_next
 from tests.kit.rigs import (
-    X_IDS,
     goals_in,
     make_plan,
     make_rig,
@@ -18,8 +17,7 @@ from tests.kit.rigs import (
 from dxlrun.channels.event_records import EventCode
 from dxlrun.dynamixel.servo.item_access import access_servo
 from dxlrun.dynamixel.servo.torque_off import limp
-from dxlsim.simulation_plan import ServoConfig
-from dxlwire.wire import protocol1, protocol2
+from dxlwire.wire import protocol1
 
 MS = 1_000_000
 MX = make_plan((1, 2, 3, 4, 5), models=("AX-12A", "MX-64", "MX-28", "AX-12A", "MX-64"), lower=-2.0, upper=2.0)
@@ -226,11 +224,6 @@ class TestOneBus:
         assert rig.packets.sent() == rig.into_bus()
         assert rig.packets.received() == rig.out_of_bus()
 
-    def test_extra_servos_on_the_line_are_left_alone(self, plan):
-        rig = start_rig(plan, extra=(ServoConfig(99, plan.servos[0].model, 1.0),))
-        rig.cycle()
-        assert rig.torque() == [True] * len(plan.servos) + [False]
-
 
 def goal_tick(servo, position):
     return round((servo.direction * position + servo.reference) / servo.rad_per_tick)
@@ -272,19 +265,6 @@ def test_a_cycle_is_eight_reads_and_one_sync_write(ax):
     }
     shown = [servo.joint_position(sent[servo.servo_id]) for servo in servos]
     assert ax.states.position == pytest.approx(shown, abs=1e-12)
-
-
-def test_a_cycle_is_one_sync_read_and_one_sync_write(arm):
-    count = len(arm.into_bus())
-    arm.goals.position[:] = np.linspace(-0.5, 0.5, 8)
-    arm.goals.velocity[:] = 1.0
-    arm.cycle()
-    goals = {
-        servo.servo_id: b"\x29\0\0\0" + goal_tick(servo, arm.goals.position[servo.row]).to_bytes(4, "little")
-        for servo in arm.plans[0].servos
-    }
-    expected = [protocol2.sync_read(126, 10, X_IDS), protocol2.sync_write(112, 8, goals)]
-    assert arm.into_bus()[count:] == expected
 
 
 def test_the_exchange_takes_what_protocol_md_and_the_budget_say(ax, arm):
@@ -341,39 +321,6 @@ def test_the_states_have_only_the_hardware_errors_of_an_error_byte(ax, error, sh
     assert ax.states.hardware_error[3] == shown
     assert ax.states.valid[3]
     assert len(ax.events.of(EventCode.SERVO_ERROR)) == 1
-
-
-@pytest.mark.parametrize("others_answer", [False, True])
-def test_a_silent_servo_costs_the_others_one_cycle_at_most(arm, others_answer):
-    arm.buses[0].absent = "slot" if others_answer else "silent"
-    arm.cycle()
-    arm.servo(13).silence()
-    arm.cycle()
-    assert arm.states.valid.tolist() == [row < 2 or (others_answer and row > 2) for row in range(8)]
-    arm.cycle()
-    assert arm.states.valid.tolist() == [row != 2 for row in range(8)]
-    assert read_takes(arm) < 5 * MS
-    arm.cycle()
-    arm.servo(13).silence(False)
-    arm.cycles(20)
-    assert arm.states.valid.all()
-    lost = set(arm.events.sources(EventCode.READ_LOST))
-    assert "arm_13_joint" in lost
-    assert len(lost) == (1 if others_answer else 6)
-    arm.restless = 0.002
-    arm.cycles(10)  # a servo that missed a turn is asked for its torque before it gets goals again
-    assert arm.goals_sent()[-1][1] == list(X_IDS)
-
-
-def test_an_alert_is_read_once(arm):
-    arm.cycle()
-    begun = len(arm.into_bus())
-    arm.servo(14).poke("hardware_error_status", 0x20)
-    arm.cycles(4)
-    assert len(arm.events.of(EventCode.SERVO_ERROR)) == 2
-    assert arm.states.valid.all()
-    assert arm.states.hardware_error.tolist() == [0, 0, 0, 0x20, 0, 0, 0, 0]
-    assert arm.into_bus()[begun:].count(protocol2.read_range(14, 70, 1)) == 1
 
 
 @pytest.mark.parametrize("late_ms", [20.1, 20.3, 20.6, 20.9, 40.3, 40.6])

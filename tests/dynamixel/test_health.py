@@ -34,13 +34,6 @@ def test_a_lost_servo_leaves_the_exchange_and_is_asked_once_a_second(rig):
     assert rig.events.sources(EventCode.SERVO_LOST) == ["arm_13_joint"]
 
 
-def test_a_lost_servo_of_protocol_1_is_pinged_too():
-    rig = start_rig(make_plan((1, 3, 5)))
-    rig.servo(3).silence()
-    rig.cycles(120)
-    assert protocol1.ping(3) in rig.into_bus()
-
-
 def test_a_bus_that_stands_still_for_a_moment_loses_no_servo_at_any_rate(rig):
     """Three cycles at 500 Hz are less than a USB adapter, or a machine, stands still for now and then."""
     begun = rig.clock.now_ns()
@@ -178,20 +171,6 @@ def test_a_tick_shows_a_reboot(value, after_ms, rebooted):
 
 def test_a_reply_that_was_long_under_way_is_no_reboot():
     assert tick(1_000, 1_000_000_000, 1_150_000_000).rebooted(tick(0, 0)) is False
-
-
-def test_a_line_that_is_gone_costs_its_own_servos_only_and_is_reported_once():
-    rig = start_rig(make_plan((1, 2), name="left"), make_plan((1, 7), name="right", first_row=2))
-    rig.ports.ports[0].unplug()
-    for _ in range(10):
-        rig.cycle()
-        assert rig.states.valid.tolist() == [False, False, True, True]
-    (text,) = rig.events.texts(EventCode.PORT_LOST)
-    assert text.startswith("bus left on sim")
-    failures = rig.hardware.stop()
-    assert len(failures) == 2
-    assert all("bus left" in failure for failure in failures)
-    assert rig.torque(1) == [False, False]
 
 
 def test_stop_with_a_silent_servo_limps_those_behind_it_at_once():

@@ -5,7 +5,7 @@ from tests.kit.rigs import make_plan
 
 from dxlrun.compile.robot_compiler import compile_files
 from dxlrun.dynamixel.tools.inspection import identify, read_models
-from dxlrun.errors import PortError, StartUpError
+from dxlrun.errors import PortError
 from dxlsim.bus.ledger import Ledger
 from dxlsim.bus.simulated_bus import SimulatedBus
 from dxlsim.simulation_plan import BusConfig, ServoConfig
@@ -107,12 +107,3 @@ def test_a_simulated_servo_is_not_asked(tmp_path):
     robot.write_text(ROBOT.replace("PORT", "sim"))
     compiled = compile_files(robot, {}, [], None, read_models)
     assert compiled.plan.buses[0].servos[0].model == "XM430-W350"
-
-
-def test_who_does_not_answer_is_said_before_the_run(simulated_line, tmp_path):
-    path, finish = simulated_line(BusConfig("main", 1_000_000, servos("XL-320")[:0], 2.0))
-    robot = tmp_path / "robot.yaml"
-    robot.write_text(ROBOT.replace("PORT", path))
-    with pytest.raises(StartUpError, match=r"shoulder \(ID 1 on bus main\) does not answer"):
-        compile_files(robot, {}, [], None, read_models)
-    assert finish() != ()

@@ -1,10 +1,8 @@
 """The compiled kernel does what the parser does, whatever arrives; and what it promises on its own."""
 
-import ctypes
 import os
 import re
 import shutil
-import subprocess
 import time
 import tty
 from contextlib import suppress
@@ -15,7 +13,6 @@ import numpy as np
 import pytest
 from tests.kit.awaited import until
 from tests.kit.campaigns import campaign
-from tests.kit.line_faults import turn_by_hand
 from tests.kit.loaded import loaded
 from tests.kit.rigs import make_plan, make_rig, start_rig
 
@@ -23,7 +20,6 @@ import fuzz_kernel as fuzz
 from dxlrun.channels.cycle import Commands, States
 from dxlrun.dynamixel.dynamixel_hardware import DynamixelHardware, ServoArrays
 from dxlwire.clock import MonotonicClock
-from dxlwire.compiled import parse_structs
 from dxlwire.exceptions import NotCompiled
 from dxlwire.exchange import bus_engine, kernel
 from dxlwire.exchange.bus_engine import FREE_NS, Lines
@@ -128,39 +124,6 @@ def test_an_object_that_is_absent_or_of_another_source_is_refused(tmp_path, monk
         kernel.library(path=tmp_path / "absent.so")
 
 
-def test_structs_of_c_are_read_with_their_pointers_arrays_and_functions(tmp_path):
-    source = """
-#define COUNT 3
-typedef struct { /* with a remark; */
-    int16_t one, two;
-} Small;
-typedef struct Big {
-    const Small *many, *more; /* pointers */
-    uint8_t flags[COUNT];
-    Small own[2];
-    double (*call)(int32_t a, double b);
-    float last;
-} Big;
-"""
-    small, big = parse_structs(source).values()
-    assert [(name, ctypes.sizeof(kind)) for name, kind in small._fields_] == [("one", 2), ("two", 2)]
-    sizes = {"many": 8, "more": 8, "flags": 3, "own": 8, "call": 8, "last": 4}
-    assert {name: ctypes.sizeof(kind) for name, kind in big._fields_} == sizes
-    program = source + "int size(int n) { return n ? sizeof(Big) : sizeof(Small); }"
-    (tmp_path / "both.c").write_text("#include <stdint.h>" + program)
-    command = [
-        shutil.which("cc") or "cc",
-        "-shared",
-        "-fPIC",
-        "-o",
-        tmp_path / "both.so",
-        tmp_path / "both.c",
-    ]
-    subprocess.run(command, check=True)
-    found = ctypes.CDLL(str(tmp_path / "both.so"))
-    assert [found.size(0), found.size(1)] == [ctypes.sizeof(small), ctypes.sizeof(big)]
-
-
 @pytest.fixture
 def rig():
     """Two servos that the kernel reads."""
@@ -200,31 +163,6 @@ def test_no_row_is_valid_of_a_line_that_took_no_goals(accident):
         rig.ports.ports[1]._arrived += b"\x55"
     rig.hardware.read_states()  # no gap came between, in which the lost line is set aside
     assert rig.states.valid.tolist() == [False, False, True]
-
-
-def test_two_servos_that_jump_to_the_place_of_one_another_are_not_believed():
-    rig = make_rig(make_plan((1,), first_row=1), make_plan((2,), name="other", first_row=0))
-    servos = rig.servo(1), rig.servo(2, bus=1)
-    for servo, angle in zip(servos, (1.0, 4.0), strict=True):
-        turn_by_hand(servo, angle)
-    rig.hardware.start()
-    rig.cycles(5)
-    assert rig.hardware._by_kernel
-    before = rig.states.position.tolist()
-    for servo, angle in zip(servos, (4.0, 1.0), strict=True):
-        turn_by_hand(servo, angle)
-    rig.hardware.read_states()
-    assert rig.states.valid.tolist() == [False, False]
-    assert rig.states.position.tolist() == before
-
-
-@pytest.mark.parametrize("step", [2.0, -2.0])
-def test_a_servo_that_jumps_is_not_believed_in_either_direction(rig, step):
-    before = rig.states.position.tolist()
-    turn_by_hand(rig.servo(2), rig.servo(2).shaft_angle + step)
-    rig.hardware.read_states()
-    assert rig.states.valid.tolist() == [True, False]
-    assert rig.states.position.tolist() == before
 
 
 def test_line_that_is_gone_gets_no_second_packet_with_goals():
@@ -279,59 +217,6 @@ def test_a_robot_for_which_the_kernel_has_no_room_gets_its_goals_and_is_read_by_
         steady(side, protocol2)
         assert side.states.valid.all()
     assert side.began == 0
-
-
-@pytest.mark.parametrize("gone", [False, True], ids=["alone", "beside a lost line"])
-def test_a_reply_from_before_its_request_is_stray_however_late_the_host_looks(gone):
-    plans, dialect = fuzz.robot("single reads", 2)
-    side = fuzz.Side(plans)
-    goals = np.full_like(side.goals.values, np.nan)
-    _, line = side.lines.ports
-    before = b""
-    for number in range(16):
-        reads = side.prepare()
-        data = bytes((240 + number, 1, 0, 0, 0, 0))
-        replies = [
-            [(one.packet, [(3_000_000, dialect.status_packet(one.servo_id, 0, data))]) for one in mine]
-            for mine in reads
-        ]
-        if gone and number == 6:
-            replies[0] = [(reads[0][0].packet, None)]
-        if number == 15:
-            assert side.hardware._by_kernel
-            line.arriving.append((side.lines.clock.now_ns(), before))
-            line.stall_ns = 2_000_000  # longer than the wire takes for both
-        side.cycle(replies, goals)
-        before = replies[1][0][1][0][1]
-    assert str(side.hardware._buses[0].failure) == ("it is gone" if gone else "None")
-    logged = [packet for packet in side.log if packet.bus == 1]
-    assert logged[0].kind is not PacketKind.INSTRUCTION
-    answers = [packet.data for packet in logged[1:] if packet.kind is PacketKind.STATUS]
-    assert answers == [pieces[0][1] for _, pieces in replies[1]]
-    assert side.states.valid[len(plans[0].servos) :].all()
-
-
-@by_both
-def test_a_doubled_reply_is_logged_in_the_same_cycle_by_kernel_and_parser(by_parser):
-    plans, dialect = fuzz.robot("sync read", 3)
-    side = fuzz.Side(plans, by_parser=by_parser)
-    goals = np.full_like(side.goals.values, np.nan)
-    counts = []
-    for number in range(8):
-        replies = []
-        for index, ((read,),) in enumerate(zip(side.prepare(), strict=True)):
-            answers = [dialect.status_packet(one.servo_id, 0, bytes(one.length)) for one in read.awaited]
-            pieces = [(2_000_000, b"".join(answers))]
-            if number == 6 and index != 1:  # at the instant of the other lines' last replies
-                pieces = [(2_000_000, b"".join([*answers, answers[0]])), (2_000_000, answers[0])]
-            replies.append([(read.packet, pieces)])
-        assert number != 6 or side.hardware._by_kernel is not by_parser
-        side.cycle(replies, goals)
-        statuses = [packet.bus for packet in side.log if packet.kind is PacketKind.STATUS]
-        counts.append([statuses.count(bus) for bus in range(3)])
-        assert side.states.valid.all()
-    # the parser hears every line that a wait has shown before it waits again; so does the kernel
-    assert counts[5:] == [[4, 4, 4], [5, 4, 5], [5, 4, 5]]
 
 
 class Terminal:

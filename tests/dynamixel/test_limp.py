@@ -6,9 +6,8 @@ import sys
 from functools import partial
 
 import pytest
-from msgspec.structs import replace
 from tests.kit.line_faults import delay_next, truncate_next
-from tests.kit.rigs import every_servo, make_plan, make_rig, start_rig
+from tests.kit.rigs import every_servo, make_plan, start_rig
 
 from dxlrun.dynamixel.servo.torque_off import LATE_NS, LONGER_NS, limp, stand
 
@@ -103,10 +102,6 @@ def test_the_guardians_path_imports_no_numpy():
     assert result.stdout.strip() == "False"
 
 
-def test_no_servo_to_limp():
-    assert limp(make_rig(make_plan(())).lines) == ()
-
-
 def wheels(model="XM430-W350", protocol=2.0, *, ids=(1, 2), velocity=1.0):
     """Return wheels of which the first one turns."""
     ends = {"lower": -math.inf, "upper": math.inf, "reference": math.pi, "return_delay_ns": 0}
@@ -186,18 +181,3 @@ def test_the_last_hand_waits_for_the_end_of_a_reply_that_is_on_its_way(rig, last
     last_hand(rig.lines)
     notes = [entry.note for entry in rig.ledger.entries if entry.t_ns > begun_ns]
     assert [note for note in notes if note.startswith("collision")] == []
-
-
-def test_a_loop_that_is_late_again_and_again_clears_a_servos_watchdog_once():
-    rig = start_rig(
-        replace(make_plan((1, 2), protocol=2.0, model="XM430-W350", return_delay_ns=0), watchdog_ticks=10)
-    )
-    for _ in range(20):
-        rig.hardware.read_states()
-        rig.hardware.write_goals()
-        rig.clock.wait_until(rig.clock.now_ns() + 300_000_000)
-        rig.hardware.idle(rig.clock.now_ns())  # no time for anything in it
-    since = len(rig.into_bus())
-    rig.cycles(10)
-    assert sorted(one for one, address, data in rig.writes(since) if (address, data) == (98, b"\0")) == [1, 2]
-    assert rig.torque() == [True, True]

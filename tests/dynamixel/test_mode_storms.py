@@ -1,14 +1,18 @@
-"""Mode changes while the line and the servos fail: no servo ever gets a goal that another mode would follow.
+"""Changes of modes and registers while the line and the servos fail.
 
-A storm is 8 s of a robot at 50 Hz; CI runs two of each robot, `pytest --campaign=release FILE` 300.
+No servo ever gets a goal that another mode would follow, each request for a register is answered once, and a
+confirmed value is there. A storm is 8 s of a robot at 50 Hz; CI runs two of each robot,
+`pytest --campaign=release FILE` 300.
 """
 
 import numpy as np
 import pytest
 from tests.kit.campaigns import campaign
-from tests.kit.rigs import make_plan, random_fault, start_rig
+from tests.kit.rigs import every_servo, make_plan, random_fault, start_rig
 
 from dxlrun.channels.event_records import EventCode
+from dxlwire.bus_plan import RegisterValue
+from dxlwire.control_table import find_table
 from dxlwire.modes import Mode
 from dxlwire.plan.mode_plan import in_mode
 
@@ -22,10 +26,36 @@ ROBOTS = {
         "XM430-W350",
         2.0,
         (Mode.POSITION, Mode.VELOCITY, Mode.EFFORT, Mode.PWM, Mode.EFFORT_POSITION),
+        ("position_p_gain", "position_d_gain"),
     ),
-    "mx": ("MX-64", 1.0, (Mode.POSITION, Mode.VELOCITY, Mode.EFFORT)),
-    "ax": ("AX-12A", 1.0, (Mode.POSITION, Mode.VELOCITY, Mode.PWM)),
+    "mx": ("MX-64", 1.0, (Mode.POSITION, Mode.VELOCITY, Mode.EFFORT), ("p_gain", "d_gain")),
+    "ax": ("AX-12A", 1.0, (Mode.POSITION, Mode.VELOCITY, Mode.PWM), ("cw_compliance_slope",)),
 }
+"""Model, protocol, modes, and the registers that the robot file declares."""
+RAM = {2.0: 64, 1.0: 24}
+"""First address (e-Manual XM430-W350, MX-64)."""
+
+
+class Wishes:
+    """What was asked of each servo's registers, and what came of it."""
+
+    def __init__(self, rig, declared):
+        self.rig = rig
+        self.answers = []
+        self.possible = {(row, name): {value} for row in range(3) for name, value in declared.items()}
+        """What each register may hold: what was answered well last, and what was tried since without."""
+
+    def ask(self, row, name, value):
+        answers = []
+        self.answers.append(answers)
+        self.possible.setdefault((row, name), {0}).add(value)
+
+        def done(problem, _found):
+            answers.append(problem)
+            if not problem:
+                self.possible[row, name] = {value}
+
+        self.rig.hardware.write_register(row, name, value, done)
 
 
 def selected(servo, protocol):
@@ -68,13 +98,26 @@ def judge(rig, sent):
 
 
 def storm(name, chance):
-    """Let a robot change modes in a storm, and judge each cycle; return the robot at rest again."""
-    model, protocol, modes = ROBOTS[name]
+    """Let a robot change modes and registers in a storm, and judge each cycle.
+
+    Return the robot at rest again, and the wishes.
+    """
+    model, protocol, modes, names = ROBOTS[name]
+    items = find_table(model, protocol).items
+    declared = dict.fromkeys(names, 20)
+    settings = tuple(
+        RegisterValue(items[one].address, items[one].size, value, one) for one, value in declared.items()
+    )
     change = {"reference": np.pi} if protocol == 2.0 else {}
-    rig = start_rig(make_plan((1, 2, 3), model=model, protocol=protocol, return_delay_ns=0, **change))
+    plan = make_plan((1, 2, 3), model=model, protocol=protocol, return_delay_ns=0, **change)
+    rig = start_rig(every_servo(plan, settings=settings))
+    begun, registers = len(rig.into_bus()), Wishes(rig, declared)
     for cycle in range(400):
         if cycle < 250 and chance.random() < 0.08:
             wishes(rig, chance, modes)
+        if cycle < 250 and chance.random() < 0.08:
+            one = chance.choice((*names, "led"))
+            registers.ask(chance.randrange(3), one, chance.randrange(2 if one == "led" else 250))
         if cycle < 250 and chance.random() < 0.05:
             random_fault(rig, chance)
         follow(rig, -0.02 if cycle % 2 else 0.02)  # one that stays is not sent
@@ -84,13 +127,16 @@ def storm(name, chance):
         judge(rig, rig.goals_sent(seen))
         rig.hardware.idle(rig.clock.now_ns() + chance.choice((2_000_000, 12_000_000)))
         rig.clock.wait_until(2_000_000_000 + cycle * rig.period_ns)
-    return rig
+    selecting = {value.address for mode in plan.servos[0].modes for value in mode.operating}
+    eeprom = {address for _, address, _ in rig.writes(begun) if address < RAM[protocol]}
+    assert eeprom <= selecting
+    return rig, registers
 
 
 @campaign(ci=2, night=50, release=300)
 @pytest.mark.parametrize("name", ROBOTS)
-def test_servo_gets_only_goals_of_its_mode_which_is_known_after_the_storm(name, number, chance):
-    rig = storm(name, chance)
+def test_servo_gets_only_goals_of_its_mode_and_has_its_registers_after_the_storm(name, number, chance):
+    rig, wanted = storm(name, chance)
     out = (EventCode.SERVO_LIMP, EventCode.SERVO_LOST, EventCode.SERVO_REBOOTED)
     excused = {source for code in out for source, _ in rig.events.of(code)}
     assert rig.plans[0].servos
@@ -103,3 +149,6 @@ def test_servo_gets_only_goals_of_its_mode_which_is_known_after_the_storm(name, 
         if servo.joint not in excused:
             assert known is not Mode.UNKNOWN, f"it is not known in which mode {servo.joint} is"
             assert rig.torque()[servo.row], f"{servo.joint} lost its torque over a change"
+    assert all(len(answers) == 1 for answers in wanted.answers)
+    for (row, item), possible in wanted.possible.items():
+        assert rig.buses[0].servos[row].registers[item] in possible, (row, item)

@@ -15,7 +15,7 @@ from dxlrun.channels.event_records import EventCode
 from dxlwire.bus_plan import RegisterValue
 from dxlwire.control_table import find_table
 from dxlwire.modes import Mode
-from dxlwire.plan.mode_plan import mode_in, position_reach
+from dxlwire.plan.mode_plan import mode_in
 from dxlwire.wire import protocol2
 
 P, V, E, W, C = Mode.POSITION, Mode.VELOCITY, Mode.EFFORT, Mode.PWM, Mode.EFFORT_POSITION
@@ -139,21 +139,6 @@ def ax():
     return make_one("AX-12A", 1.0)
 
 
-def count_goals(rig, servo_id, since=0):
-    """Return how many sync writes name a servo."""
-    return sum(servo_id in named for _, named in rig.goals_sent(since))
-
-
-def test_no_goal_is_sent_while_the_mode_changes(arm):
-    arm.restless = 0.002
-    arm.cycle()
-    since = len(arm.into_bus())
-    arm.set_modes(V, 0)
-    arm.cycles(2)
-    assert arm.states.mode.tolist() == [V, P]
-    assert (count_goals(arm, 1, since), count_goals(arm, 2, since)) == (0, 2)
-
-
 def test_what_the_file_declares_holds_in_another_mode_whose_own_values_differ():
     """A change resets gains "properly to the selected Operating Mode" (e-Manual, X series, Operating Mode
     (11)), which does not say to what: here to 400, and more than the manual names."""
@@ -196,17 +181,6 @@ def test_of_two_modes_that_are_selected_alike_the_one_of_the_start_counts():
     for mode in (V, W):
         plan = make_plan((1,), start_mode=mode, **ENDLESS)
         assert mode_in(plan.servos[0], wheel) is mode
-
-
-def test_a_goal_that_stays_costs_nothing_on_the_wire_but_now_and_then(arm):
-    arm.cycles(2)
-    since = len(arm.into_bus())
-    arm.cycles(100)
-    assert count_goals(arm, 1, since) == 2
-    since = len(arm.into_bus())
-    arm.goals.position[0] += 0.1
-    arm.cycles(3)
-    assert (count_goals(arm, 1, since), count_goals(arm, 2, since)) == (2, 0)
 
 
 @pytest.mark.parametrize(("model", "protocol"), [("XM430-W350", 2.0), ("MX-28", 1.0), ("PH54-200-S500", 2.0)])
@@ -259,14 +233,6 @@ def test_a_joint_that_forgot_its_turns_over_a_reboot_does_not_wind_them_up_again
     rig.cycles(20)
     assert rig.torque() == [True, True]
     assert servo.shaft_angle == pytest.approx(standing, abs=0.1)
-
-
-def test_a_wheel_that_is_led_by_its_velocity_gets_torque_again_after_a_reboot():
-    rig = make_wheel()
-    rig.cycles(20)
-    rig.servo(1).cut_power(rig.clock.now_ns() + 300_000_000)
-    rig.cycles(150)
-    assert rig.torque() == [True, True]
 
 
 def test_a_wheel_that_made_more_turns_than_its_servo_counts_does_not_wind_them_back():
@@ -345,24 +311,6 @@ def test_a_servo_that_reboots_in_its_own_mode_change_gets_no_torque_by_that(mode
             break
         assert not servo.torque_on, number
     assert len(rebooted) > 10
-
-
-def test_a_mode_is_entered_though_no_cycle_leaves_time_for_it():
-    rig = start_rig(make_pair())
-    rig.cycles(10)
-    rig.set_modes(V, Mode.UNKNOWN)
-    for _ in range(400):
-        rig.hardware.idle(rig.clock.now_ns())
-        rig.hardware.read_states()
-        rig.hardware.write_goals()
-        rig.wait(1_000_000)
-    assert rig.states.mode.tolist() == [V, P]
-    assert "of idle time, but a cycle leaves only" in rig.events.texts(EventCode.OVERRUN)[0]
-
-
-def test_extended_positions_reach_as_far_as_the_manual_says():
-    """e-Manual XM430-W350, Goal Position (116): -1,048,575 to 1,048,575, 256 turns."""
-    assert position_reach(find_table("XM430-W350", 2.0), True) == (-1_048_575, 1_048_575)
 
 
 # Limits of the torque

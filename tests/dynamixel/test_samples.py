@@ -6,7 +6,6 @@ from tests.kit.rigs import make_plan, make_rig
 
 from dxlrun.channels.event_records import EventCode
 from dxlwire.exchange.samples import REPORT_AGAIN_NS
-from dxlwire.modes import Mode
 
 MS = 1_000_000
 SECOND_NS = 1_000_000_000
@@ -93,20 +92,6 @@ def test_a_lost_row_keeps_its_own_values_and_ages():
     assert not states.valid[5]
     assert states.age_ns[5] == 10 * MS
     assert (states.position != kept).sum() == 7
-
-
-@pytest.mark.parametrize("mode", [Mode.VELOCITY, Mode.PWM, Mode.POSITION, Mode.UNKNOWN])
-def test_the_speed_of_a_wheel_that_controls_none_is_a_part_of_full_output(mode):
-    robot = Robot(make_plan((1, 2), continuous=True))
-    robot.states.mode[0] = mode
-    robot.all_said(512, 100, 0)
-    robot.states.mode[1] = Mode.VELOCITY
-    robot.all_said(512, 100, 0)
-    wheels = [servo.mode_plan(Mode.VELOCITY).present_rad_s_per_tick for servo in robot.servos]
-    servo = robot.servos[0]
-    unit = wheels[0] if mode in (Mode.VELOCITY, Mode.PWM) else servo.rad_s_per_tick
-    assert wheels[0] != servo.rad_s_per_tick
-    assert robot.states.velocity == pytest.approx([-100 * unit, 100 * wheels[1]])
 
 
 class TestJumps:

@@ -13,20 +13,14 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
-from tests.kit.rigs import make_plan, make_rig
 
 import dxlrun
 from dxlrun.channels.child_processes import memory_file
-from dxlrun.channels.cycle import Commands, States
 from dxlrun.compile.robot_compiler import compile_files
-from dxlrun.dynamixel.dynamixel_hardware import DynamixelHardware, ServoArrays
 from dxlrun.dynamixel.tools.tool_line import TunablePort
 from dxlrun.errors import PortError, help_link
 from dxlrun.plan.robot_plan import to_json
 from dxlrun.process_table import robot_of
-from dxlsim.simulation_plan import BusConfig, ServoConfig
-from dxlwire.clock import MonotonicClock
-from dxlwire.exchange.bus_engine import Lines
 from dxlwire.port.ports import SerialPort, SerialPorts
 from dxlwire.port.reopening import KeptLines, LineSettings
 from dxlwire.port.serial_open import let_go, open_serial, rate_remark
@@ -269,27 +263,3 @@ def test_the_lock_goes_with_whoever_has_the_line_although_its_other_end_stays(te
 
 def _is_locked(descriptor: int) -> bool:
     return fcntl.ioctl(descriptor, 0x80045440, b"\0\0\0\0") == b"\1\0\0\0"  # TIOCGEXCL of asm-generic
-
-
-def test_the_same_code_drives_the_simulated_process(simulated_line):
-    ids = (1, 3, 5, 6, 2, 4, 20, 21)
-    servos = tuple(ServoConfig(servo_id, "AX-12A", 2.0) for servo_id in ids)
-    path, finish = simulated_line(BusConfig("main", 1_000_000, servos))
-    rig = make_rig()  # for its sinks only
-    states, goals, clock = States.empty(8), Commands.empty(8), MonotonicClock(0)
-    with open_serial(path, 1_000_000) as line:
-        ports = SerialPorts([SerialPort(line.fileno(), path)])
-        lines = Lines([make_plan()], ports, clock, rig.packets)
-        hardware = DynamixelHardware(lines, rig.packets, ServoArrays(states, goals), rig.events)
-        hardware.start()
-        assert states.valid.all()
-        for _ in range(5):
-            hardware.read_states()
-            hardware.write_goals()
-        assert hardware.stop() == ()
-        ports.wait_for_bytes(clock.now_ns() + 5_000_000)
-    ledger = finish()
-    recorded = rig.packets
-    assert recorded.received() == b"".join(entry.data for entry in ledger if entry.direction == "out")
-    assert b"".join(recorded.sent()) == b"".join(entry.data for entry in ledger if entry.direction == "in")
-    assert any(packet[4] == 0x83 for packet in recorded.sent())

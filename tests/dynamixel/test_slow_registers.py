@@ -98,14 +98,6 @@ def test_a_reboot_that_no_read_missed_is_seen_by_the_tick(returning):
     assert (12 in rig.goals_sent()[-1][1]) == returning
 
 
-def test_ten_minutes_pass_without_a_false_reboot():
-    rig = start(make_x((11,)))
-    rig.period_ns = SECOND_NS  # the tick does not care how often the states are read
-    rig.cycles(10 * 60)
-    assert rig.events.of(EventCode.SERVO_REBOOTED) == []
-    assert rig.events.of(EventCode.SERVO_LIMP) == []
-
-
 def test_a_hardware_error_is_in_the_states_as_long_as_it_stands():
     rig = start()
     rig.cycles(5)

@@ -6,7 +6,7 @@ from functools import partial
 
 import pytest
 from msgspec.structs import replace
-from tests.kit.line_faults import disturb_replies, truncate_next
+from tests.kit.line_faults import truncate_next
 from tests.kit.plans import distinct_tables
 from tests.kit.rigs import make_plan, make_rig, make_x, start_rig
 
@@ -17,9 +17,6 @@ from dxlrun.dynamixel.servo.item_access import first_reach
 from dxlrun.dynamixel.servo.registers import write_registers
 from dxlrun.errors import PortError, StartUpError
 from dxlrun.features.registers.settings import declarable, register_value
-from dxlsim.bus.simulated_bus import PacketFault
-from dxlsim.bus.simulated_line import flipped
-from dxlsim.simulation_plan import ServoConfig
 from dxlwire.control_table import find_table
 from dxlwire.wire import protocol1
 
@@ -45,14 +42,6 @@ def test_the_end_of_the_set_up_without_torque_is_reported_before_the_first_torqu
     assert packets > 8  # all were inspected
 
 
-@pytest.mark.parametrize("number", range(6))
-def test_noise_in_one_reply_of_the_start_refuses_no_servo(number):
-    rig = make_rig(make_plan((1,)))
-    disturb_replies(rig.buses[0], 1, {number: PacketFault("noise", lambda reply: flipped(reply, -1, 1))})
-    rig.hardware.start()
-    assert rig.torque() == [True]
-
-
 def test_servos_that_are_all_silent_are_one_sentence_within_two_seconds():
     rig = make_rig()
     for servo in rig.buses[0].servos:
@@ -62,13 +51,6 @@ def test_servos_that_are_all_silent_are_one_sentence_within_two_seconds():
     assert rig.clock.now_ns() - before < 2_000_000_000
     assert problem.startswith("none of the 8 servos on bus main answers: main_1_joint (ID 1), main_3")
     assert " and IDs " in problem
-
-
-def test_a_servo_with_the_id_of_another_is_read_no_further():
-    rig = make_rig(extra=(ServoConfig(5, "AX-12A", 0.7, 440_000),))
-    rig.refused()
-    asked = [packet for packet in rig.into_bus() if packet[2] == 5]
-    assert asked == [protocol1.ping(5)] * 3
 
 
 def test_first_states_that_a_standing_host_did_not_hear_are_read_again(monkeypatch):

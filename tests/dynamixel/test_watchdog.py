@@ -150,11 +150,6 @@ class TestLeftHolding:
         moved = [abs(servo.shaft_angle - at) for servo, at in zip(rig.buses[0].servos, stood, strict=True)]
         return rig.events.texts(EventCode.WATCHDOG)[before:], moved
 
-    def test_servos_are_not_stopped(self, started):
-        started.cycles(5)
-        assert self.leave(started)[0] == []
-        assert armed(started) == [0] * 4
-
     def test_servos_that_were_stopped_stay_where_they_stopped(self, started):
         move_far(started)
         started.wait(300 * MS)

@@ -155,11 +155,6 @@ class Host:
     def is_silent(self, servo_id: int) -> bool:
         return self._impatiently(lambda: self.sdk.ping(self.port, servo_id)[1] != COMM_SUCCESS)
 
-    def answers_again(self, servo_id: int) -> bool:
-        """Wait until a servo that starts again answers."""
-        self.simulation.expect_haste(self.bus)
-        return self._impatiently(lambda: until(lambda: self.sdk.ping(self.port, servo_id)[1] == COMM_SUCCESS))
-
     def _impatiently(self, ask: Callable[[], bool]) -> bool:
         patience, self.port.patience_ms = self.port.patience_ms, 30.0
         try:

@@ -132,14 +132,6 @@ def test_a_differential_moves_one_joint_by_the_sum_and_one_by_the_difference(oth
     assert moved.angle - [0, 1] == pytest.approx([way, way * other], rel=0.03)
 
 
-def test_the_weight_of_a_differentials_joint_hangs_on_both_servos():
-    held = plant(differential(Load(0.02, gravity=0.4, gravity_angle=-math.pi / 2), NO_LOAD))
-    run(held, 0.5, drive=[0.2, 0.2])
-    assert held.angle == pytest.approx([0.0, 1.0], abs=1e-9)
-    run(held, 0.2, drive=[0.2, 0.0])
-    assert held.angle[1] < 1.0 - 0.05
-
-
 def test_friction_of_servo_and_joint_holds_what_it_can_hold():
     motor = msgspec.structs.replace(ROTOR, friction=0.05)
     for drive, holds in ((0.095, True), (0.115, False)):  # 0.05 of each servo's own, and half of the joint's

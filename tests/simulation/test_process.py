@@ -12,7 +12,6 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-import rustypot
 import serial
 from tests.kit.awaited import DEADLINE_S
 from tests.kit.bus_process import BusProcess, launch, opened, receive
@@ -23,7 +22,6 @@ from dxlsim.serving.pseudo_terminal import DeviceLink, PseudoTerminal
 from dxlsim.serving.realtime_serving import PollBudget
 from dxlsim.serving.simulation_server import _WRITTEN, lateness_us
 from dxlsim.simulation_plan import BusConfig, ServoConfig, SimulationConfig
-from dxlwire.control_table import find_table
 
 PING_1 = bytes.fromhex("ff ff 01 02 01 fb")
 PONG_1 = bytes.fromhex("ff ff 01 02 00 fc")
@@ -113,23 +111,6 @@ def test_no_reply_is_there_before_wire_time_and_return_delay_have_passed(served)
                 os.write(port, PING_2)
                 receive(port, 14)
                 assert time.monotonic_ns() - asked_ns >= bound_ns
-
-
-def test_a_foreign_driver_finds_every_item_where_the_servo_holds_it(served):
-    """rustypot, written by others in Rust, talks to our servo: its addresses, its packets, its units."""
-    foreign = rustypot.AxPyController(served.ports["foreign"], 1_000_000, DEADLINE_S)
-    values = {"id": 1, "baud_rate": 1, "cw_angle_limit": 10, "moving_speed": 300, "punch": 40, "led": 1}
-    names = {"baud_rate": "baudrate"}
-    for name, wire in values.items():
-        foreign.write_register(1, names.get(name, name), wire)
-    for item in find_table("AX-12A").items.values():
-        ours = int.from_bytes(bytes(foreign.read_raw_data(1, item.address, item.size)), "little")
-        assert foreign.read_register(1, names.get(item.name, item.name)) == ours
-        assert ours == values.get(item.name, ours)
-    assert foreign.ping(2)
-    foreign.sync_write_raw_goal_position([1, 2], [600, 400])
-    assert foreign.read_raw_goal_position(1) == [600]
-    foreign.close()
 
 
 def test_ledger_holds_exactly_what_passed_and_no_reply_is_early(served):

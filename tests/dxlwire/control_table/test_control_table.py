@@ -7,11 +7,9 @@ from pathlib import Path
 
 import pytest
 import rustypot
-from hypothesis import given
-from hypothesis import strategies as st
 
 import dxlwire.control_table
-from dxlwire.control_table import ControlItem, find_table, read_control_table
+from dxlwire.control_table import ControlItem, decoded, find_table, read_control_table
 
 AX = find_table("AX-12A")
 AX_TEXT = (Path(dxlwire.control_table.__file__).parent / "tables/protocol1/AX-12A.toml").read_text("utf-8")
@@ -40,28 +38,20 @@ def test_units_are_exact_and_not_the_rounded_ones_of_the_manual() -> None:
     assert {name: (AX.items[name].unit, AX.items[name].scale) for name in units} == units
 
 
-@pytest.mark.parametrize(
-    ("ticks", "data"), [(0, "0000"), (1, "0100"), (1023, "ff03"), (-1, "0104"), (-1023, "ff07")]
-)
-def test_direction_is_bit_10(ticks: int, data: str) -> None:
-    assert AX.items["present_speed"].encode(ticks) == bytes.fromhex(data)
-    assert AX.items["present_speed"].decode(bytes.fromhex(data)) == ticks
-
-
 def test_a_zero_with_direction_is_zero() -> None:
     assert AX.items["present_load"].decode(b"\x00\x04") == 0  # e-Manual: "1024 is equal to 0"
-
-
-@given(st.integers(-(2**31), 2**31 - 1))
-def test_twos_complement_of_four_bytes(ticks: int) -> None:
-    item = ControlItem("x", 0, 4, "RW", "RAM", 0, 1, None, "twos_complement", "", 1.0, "")
-    assert item.decode(item.encode(ticks)) == ticks
 
 
 @pytest.mark.parametrize(("name", "ticks"), [("goal_position", -1), ("id", 256), ("present_speed", 1024)])
 def test_a_value_that_does_not_fit_is_refused_by_name(name: str, ticks: int) -> None:
     with pytest.raises(ValueError, match=name):
         AX.items[name].encode(ticks)
+
+
+def test_only_items_that_lie_whole_in_the_bytes_are_decoded() -> None:
+    items = find_table("XM430-W350", 2.0).items
+    assert decoded(items.values(), 80, b"\1\0\2\0\3") == {"position_d_gain": 1, "position_i_gain": 2}
+    assert decoded([items["position_d_gain"]], 81, b"\0\0\0") == {}
 
 
 def test_a_reply_of_the_wrong_length_is_refused() -> None:

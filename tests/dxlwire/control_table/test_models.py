@@ -75,13 +75,6 @@ def test_a_model_of_both_protocols_is_chosen_by_the_protocol() -> None:
         find_table("AX-13", 1.0)
 
 
-def test_names_by_protocol_are_all_names() -> None:
-    assert model_names() == tuple(sorted({*model_names(1.0), *model_names(2.0)}))
-    assert {"AX-12", "AX-12+", "AX-12A"} <= set(model_names(1.0))
-    assert "AX-12A" not in model_names(2.0)
-    assert {"XM430-W350", "PH54-200-S500-R", "RH-P12-RN(A)", "2XL430-W250"} <= set(model_names(2.0))
-
-
 def test_a_table_of_a_plug_in_is_found_by_name_and_number(mine: str) -> None:
     table = add_control_table(mine)
     assert find_table("Mine-1") is table
