@@ -59,6 +59,57 @@ class _Loop:
         return Completion(self._robot.record.cycle)
 
 
+async def asgi_request(
+    app: Any,
+    method: str,
+    path: str,
+    body: bytes = b"",
+    *,
+    headers: Iterable[tuple[str, bytes]] = (),
+    chunks: Iterable[Mapping[str, Any]] | None = None,
+    client: tuple[str, Role] = ("process 1", Role.ADMIN),
+    heard: list[int] | None = None,
+) -> tuple[int, dict[bytes, bytes], bytes]:
+    """Request something by ASGI; return status, headers and content.
+
+    Args:
+        chunks: Messages that come from the client instead of a body.
+        heard: Gets a number for each message that is awaited.
+    """
+    path, _, query = path.partition("?")
+    scope = {
+        "type": "http",
+        "http_version": "1.1",
+        "method": method,
+        "scheme": "http",
+        "path": path,
+        "raw_path": path.encode(),
+        "query_string": query.encode(),
+        "root_path": "",
+        "headers": [(name.encode(), value) for name, value in headers],
+        "client": client,
+        "server": None,
+    }
+    coming = iter([{"type": "http.request", "body": body}] if chunks is None else chunks)
+    said: list[dict[str, Any]] = []
+
+    async def receive() -> Mapping[str, Any]:
+        if heard is not None:
+            heard.append(1)
+        chunk = next(coming, None)
+        if chunk is None:
+            await asyncio.Event().wait()
+        assert chunk is not None
+        return chunk
+
+    async def send(message: dict[str, Any]) -> None:
+        said.append(message)
+
+    await app(scope, receive, send)
+    content = b"".join(message.get("body", b"") for message in said[1:])
+    return said[0]["status"], dict(said[0]["headers"]), content
+
+
 class _Gateway:
     """A RobotLink of one process: each request is an ASGI call."""
 
@@ -68,30 +119,9 @@ class _Gateway:
         self._app, self._asyncio = app, asyncio.new_event_loop()
 
     def exchange(self, method: str, path: str, body: bytes | None) -> tuple[int, bytes]:
-        path, _, query = path.partition("?")
-        scope = {
-            "type": "http",
-            "http_version": "1.1",
-            "method": method,
-            "scheme": "http",
-            "path": path,
-            "raw_path": path.encode(),
-            "query_string": query.encode(),
-            "root_path": "",
-            "headers": [],
-            "client": ("process 1", Role.ADMIN),
-            "server": None,
-        }
-        said: list[dict[str, Any]] = []
-
-        async def receive() -> dict[str, Any]:
-            return {"type": "http.request", "body": body or b""}
-
-        async def send(message: dict[str, Any]) -> None:
-            said.append(message)
-
-        self._asyncio.run_until_complete(self._app(scope, receive, send))
-        return said[0]["status"], b"".join(one.get("body", b"") for one in said[1:])
+        asked = asgi_request(self._app, method, path, body or b"")
+        status, _, content = self._asyncio.run_until_complete(asked)
+        return status, content
 
     def stream(self, path: str) -> Any:
         raise NotImplementedError(path)

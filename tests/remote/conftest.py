@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 import pytest
 from tests.kit.cases import read_head
+from tests.kit.driven import asgi_request
 
 import dxlrun
 from dxlrun.channels import heartbeat, mailbox, ring
@@ -33,7 +34,6 @@ from dxlrun.remote.job import Descriptors
 from dxlrun.remote.link import Link
 from dxlrun.remote.preparation import Preparation
 from dxlrun.remote.requests.replies import FRAME_LENGTH, Frame
-from dxlrun.remote.requests.request_table import Role
 from dxlrun.remote.server import serve_gateway
 from dxlrun.testing import plan_of
 
@@ -280,44 +280,12 @@ class Desk:
             data = data[end:]
         return found
 
-    async def request(
-        self, method, path, body=b"", *, headers=(), chunks=None, client=("process 1", Role.ADMIN), heard=None
-    ):
-        """One request by ASGI; `chunks` are the messages that come from the client instead of a body."""
+    async def request(self, method, path, body=b"", **options):
+        """Request something by ASGI; return status and content."""
         if not isinstance(body, bytes):
             body = json.dumps(body).encode()
-        path, _, query = path.partition("?")
-        scope = {
-            "type": "http",
-            "http_version": "1.1",
-            "method": method,
-            "scheme": "http",
-            "path": path,
-            "raw_path": path.encode(),
-            "query_string": query.encode(),
-            "root_path": "",
-            "headers": [(name.encode(), value) for name, value in headers],
-            "client": client,
-            "server": None,
-        }
-        chunks = iter([{"type": "http.request", "body": body}] if chunks is None else chunks)
-        said = []
-
-        async def receive():
-            if heard is not None:
-                heard.append(1)
-            chunk = next(chunks, None)
-            if chunk is None:
-                await asyncio.Event().wait()
-            return chunk
-
-        async def send(message):
-            said.append(message)
-
-        await self.app(scope, receive, send)
-        self.headers = dict(said[0]["headers"])
-        content = b"".join(message.get("body", b"") for message in said[1:])
-        return said[0]["status"], json.loads(content) if content else None
+        status, self.headers, content = await asgi_request(self.app, method, path, body, **options)
+        return status, json.loads(content) if content else None
 
 
 @pytest.fixture

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import os
 import signal
 import socket
 import subprocess
@@ -15,6 +14,8 @@ from typing import Any
 
 import pytest
 from tests.kit.awaited import DEADLINE_S, until
+from tests.kit.live_run import LiveRuns, Running
+from tests.kit.packages import plugin_folder
 
 import dxlrun
 from dxlrun.log.log_reader import read_log
@@ -83,7 +84,6 @@ def dxlrun_contract():
 def dxlrun_controllers():
     return {"count": Counting}
 """
-CODE = "import sys; from dxlrun.cli import main; sys.exit(main())"
 LISTENER = "import dxlrun; [print(one.number, flush=True) for one in dxlrun.connect().listen('/cycle')]"
 
 
@@ -247,39 +247,24 @@ def test_a_refusal_is_that_of_each_request(robot: Any) -> None:
 
 
 @pytest.fixture
-def running(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[subprocess.Popen[bytes]]:
+def running(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Running]:
     """A robot that publishes, in real time, until it is stopped."""
-    (tmp_path / "counting.py").write_text(PLUGIN)
-    info = tmp_path / "counting-1.0.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: my-robotics\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text("[dxlrun]\ncounting = counting\n")
-    (tmp_path / "publisher.yaml").write_text(ROBOT)
+    plugin_folder(tmp_path, "counting", PLUGIN, "my-robotics")
     (tmp_path / "run").mkdir(mode=0o700)
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "run"))
-    with (tmp_path / "stderr").open("wb") as errors:
-        process = subprocess.Popen(
-            [sys.executable, "-P", "-c", CODE, "publisher.yaml", "--duration", "300"],
-            cwd=tmp_path,
-            stdout=subprocess.DEVNULL,
-            stderr=errors,
-            env=os.environ | {"PYTHONPATH": str(tmp_path)},
-        )
-    yield process
-    process.kill()
-    process.wait()
+    runs = LiveRuns(tmp_path)
+    (tmp_path / "publisher.yaml").write_text(ROBOT)
+    yield runs.start("--duration", "300", robot=tmp_path / "publisher.yaml", plugins=tmp_path, gateway=True)
+    runs.end()
 
 
 def test_messages_come_live_until_the_run_ends_and_are_all_in_the_log(
-    running: subprocess.Popen[bytes],
+    running: Running,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     request: pytest.FixtureRequest,
 ) -> None:
-    def lives() -> None:
-        assert running.poll() is None
-
-    until(dxlrun.running, check=lives)
+    until(dxlrun.running, check=running.lives)
     with dxlrun.connect() as robot:
         (state,) = [one for one in robot.topics() if one.name == "/count/state"]
         assert (state.type, state.joints) == ("my_robotics/msg/Count", ("pan",))
@@ -299,9 +284,10 @@ def test_messages_come_live_until_the_run_ends_and_are_all_in_the_log(
             if len(found) == 30:
                 with dxlrun.connect() as other:
                     other.stop(wait=False)
-    code, said = running.wait(DEADLINE_S), (tmp_path / "stderr").read_text()
+    code, _, said = running.finish()
     assert code == 0 or "did not respond" in said, said  # the machine may have had no processor for it
-    (log,) = (tmp_path / "logs").glob("*.mcap")
+    log = running.log_path()
+    assert log is not None
     topic = read_log(log).topics["/count/state"]
     assert topic.column("number").tolist() == [*range(len(topic.data) - 1), -1]
     late = list(sleeper)

@@ -5,21 +5,18 @@ import math
 import os
 import signal
 import socket
-import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.kit.awaited import DEADLINE_S, until
+from tests.kit.awaited import until
+from tests.kit.live_run import LiveRuns
 
 import dxlrun
 from dxlrun.channels.event_records import EventCode
-from dxlrun.log.log_reader import read_log
 
-DXLRUN = Path(sys.executable).with_name("dxlrun")
 ROBOT = """\
 name: pair
 buses:
@@ -40,33 +37,33 @@ controllers:
 
 
 class Run:
-    """A `dxlrun` in a directory of its own, and what it left behind."""
+    """A run with a client, in a directory of its own, and what it left behind."""
 
-    def __init__(self, directory: Path, *words: str) -> None:
-        self.directory = directory
-        (directory / "pair.yaml").write_text(ROBOT)
-        self.process = subprocess.Popen(
-            [DXLRUN, "pair.yaml", *words],
-            cwd=directory,
-            text=True,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-        )
-        until(lambda: "pair" in dxlrun.running(), "the gateway")
+    def __init__(self, runs: LiveRuns, directory: Path) -> None:
+        self.running = runs.start(directory=directory, gateway=True)
+        until(lambda: "pair" in dxlrun.running(), "the gateway", check=self.running.lives)
         self.robot = dxlrun.connect(client="anna")
-        self.log_path = Path(str(self.robot.info()["log"]))
 
     def finish(self):
-        self.out, self.err = self.process.communicate(timeout=DEADLINE_S)
-        self.log = read_log(self.log_path)
+        self.code, self.out, self.err = self.running.finish()
+        self.log = self.running.log()
 
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory) -> Iterator[Path]:
+def runs(tmp_path_factory) -> Iterator[LiveRuns]:
     with pytest.MonkeyPatch.context() as patch:
         directory = tmp_path_factory.mktemp("run")
         patch.setenv("XDG_RUNTIME_DIR", str(directory))
-        yield directory / "dxlrun"
+        runs = LiveRuns(directory)
+        (directory / "pair.yaml").write_text(ROBOT)
+        yield runs
+        runs.end()
+
+
+@pytest.fixture(scope="module")
+def place(runs) -> Path:
+    """The directory of sockets."""
+    return Path(os.environ["XDG_RUNTIME_DIR"]) / "dxlrun"
 
 
 def misbehave(path: Path) -> None:
@@ -87,9 +84,9 @@ def misbehave(path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def steered(tmp_path_factory, place):
+def steered(tmp_path_factory, runs, place):
     """A run that was steered with everything there is, and stopped by its client."""
-    run = Run(tmp_path_factory.mktemp("steered"))
+    run = Run(runs, tmp_path_factory.mktemp("steered"))
     robot, run.refused = run.robot, []
 
     def refused(ask, *words):
@@ -118,13 +115,13 @@ def steered(tmp_path_factory, place):
     robot.send("more", "positions", {"positions": [0.2]})
     run.info, run.states, run.events = robot.info(), robot.states(), robot.events()
     robot.stop()
-    run.stopped = read_log(run.log_path)  # at once: `stop` returns when the log is closed
+    run.stopped = run.running.log()  # at once: `stop` returns when the log is closed
     run.finish()
     return run
 
 
 def test_a_steered_run_ends_well_when_its_client_stops_it(steered, place):
-    assert (steered.process.returncode, steered.err) == (0, ""), steered.out + steered.err
+    assert (steered.code, steered.err) == (0, ""), steered.out + steered.err
     assert steered.stopped.complete
     assert list(place.iterdir()) == []
     with pytest.raises(dxlrun.DxlrunError, match=r"pair no longer answers: .*No such file"):
@@ -180,25 +177,16 @@ def test_clients_that_misbehave_leave_nothing_in_the_log(steered):
     assert not [event for event in steered.log.events if event.code == EventCode.CONTROLLER_FAULT]
 
 
-def test_without_its_gateway_the_run_continues_with_a_remark(tmp_path_factory, place):
-    run = Run(tmp_path_factory.mktemp("killed"))
-    pid = gateway_of(run.process.pid)
+def test_without_its_gateway_the_run_continues_with_a_remark(tmp_path, runs, place):
+    run = Run(runs, tmp_path)
     before = run.robot.info()["cycles"]
-    os.kill(pid, signal.SIGKILL)
+    os.kill(run.running.child("remote"), signal.SIGKILL)
     until(lambda: not list(place.iterdir()), "the removal of the dead socket")
     with pytest.raises(dxlrun.DxlrunError, match="pair no longer answers"):
         run.robot.pause()
-    until(lambda: len(read_log(run.log_path).cycles) > before + 25, "more cycles")
-    run.process.send_signal(signal.SIGINT)
+    until(lambda: len(run.running.log().cycles) > before + 25, "more cycles")
+    run.running.signal(signal.SIGINT)
     run.finish()
-    assert run.process.returncode == 130, run.out + run.err
+    assert run.code == 130, run.out + run.err
     assert "the gateway ended: the run continues, but cannot be steered" in " ".join(run.err.split())
     assert run.log.complete
-
-
-def gateway_of(terminal: int) -> int:
-    """Return the process ID of a run's gateway."""
-    for child in Path(f"/proc/{terminal}/task/{terminal}/children").read_text().split():
-        if b"dxlrun.remote" in Path(f"/proc/{child}/cmdline").read_bytes().split(b"\0"):
-            return int(child)
-    raise AssertionError("there is no gateway")

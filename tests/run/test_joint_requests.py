@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from tests.kit.answers import result_of
-from tests.kit.line_faults import turn_by_hand
 from tests.kit.sampled_run import MS, SampledRun, texts, torque_of
 from tests.kit.stories import ask, send, switch, torque
 from tests.kit.totals import totals_of
@@ -14,7 +13,6 @@ from dxlrun.channels.answers import Code, Refusal
 from dxlrun.channels.commands import CommandMessage
 from dxlrun.channels.cycle import Torque
 from dxlrun.channels.event_records import EventCode
-from dxlrun.errors import InputError
 from dxlrun_analysis.joints.goal_tracking import tracking
 from dxlrun_analysis.verdict import judge_run
 
@@ -34,8 +32,6 @@ controllers:
 LIMP = ROBOT.replace("torque: on", "torque: off").replace(
     "[shoulder, elbow]}", "[shoulder, elbow], active: false}"
 )
-PUT = 2.5 - np.pi
-"""Where a hand puts the elbow."""
 
 
 @pytest.fixture
@@ -51,43 +47,6 @@ def refusal(run: SampledRun, number: int) -> str:
     answer = run.answer(number)
     assert isinstance(answer, Refusal)
     return answer.text
-
-
-def test_a_joint_is_led_by_hand_and_holds_where_it_was_put(start):
-    run = start()
-    off = run.ask(400, torque(["elbow"], on=False, release=True))
-    refused = run.ask(600, switch(["arm"]))
-    run.at(700, lambda: turn_by_hand(run.servos["elbow"], 2.5))
-    on, again = run.ask(1000, torque(["elbow"], on=True)), run.ask(1300, switch(["arm"]))
-    log = run.run()
-    assert run.is_done(off, on, again)
-    assert "elbow (ID 2 on bus main) is limp" in refusal(run, refused)
-    shown = torque_of(log, "elbow")
-    assert [one for one in shown if one not in (Torque.OFF, Torque.DOUBT)] == [
-        Torque.ON, Torque.RELEASED, Torque.GIVEN, Torque.ON,
-    ]  # fmt: skip
-    assert torque_of(log, "shoulder") == torque_of(log, "wrist") == [Torque.ON]
-    late = log.cycles["woken_ns"] > log.cycles["woken_ns"][0] + 900 * MS
-    for name in ("position", "goal_position"):
-        assert np.abs(log.cycles[name][late, 1] - PUT).max() < 0.01
-
-
-def test_a_tripped_servo_is_rebooted_and_gets_torque_in_the_run(start):
-    run = start(seconds=3.0)
-    run.at(400, run.servos["elbow"].trigger_overload)
-    tripped = run.ask(700, torque(["elbow"], on=True))
-    commanded = run.ask(750, reboot("elbow", release=False))
-    done = run.ask(800, reboot("elbow"))
-    on = run.ask(1900, torque(["elbow"], on=True))
-    log_numbers = done, on, run.ask(2200, switch(["arm"]))
-    log = run.run()
-    assert "dxlrun reboot elbow" in refusal(run, tripped)
-    assert refusal(run, commanded) == "elbow is commanded by arm; deactivate arm first, or add --release"
-    assert run.is_done(*log_numbers)
-    assert torque_of(log, "elbow")[-1] is Torque.ON
-    assert Torque.REBOOTING in torque_of(log, "elbow")
-    assert torque_of(log, "shoulder") == [Torque.ON]
-    assert not texts(log, EventCode.SERVO_LOST)
 
 
 @pytest.mark.parametrize(
@@ -132,26 +91,6 @@ def test_a_pose_at_the_end_does_not_wait_for_limp_joints(start):
     assert not [text for text in texts(log, EventCode.POLICY) if "ends early" in text]
 
 
-@pytest.mark.parametrize(
-    ("text", "place", "sentence"),
-    [
-        (
-            LIMP.replace(", active: false", ""),
-            "10:3",
-            "controller arm is active from the start, but torque is off for elbow",
-        ),
-        (ROBOT.replace("torque: on", "torque: maybe"), "7:90", "torque is on or off"),
-        (ROBOT.replace("torque: on", "torque: 1"), "7:90", "torque is on or off"),
-    ],
-)
-def test_what_cannot_be_limp_is_an_error_at_its_place(start, text, place, sentence):
-    with pytest.raises(InputError, match="torque") as error:
-        start(text)
-    (problem,) = error.value.problems
-    assert sentence in str(problem)
-    assert f"robot.yaml:{place}" in str(problem)
-
-
 def test_check_shows_it(tmp_path, dxlrun):
     file = tmp_path / "arm.yaml"
     file.write_text(LIMP)
@@ -162,18 +101,6 @@ def test_check_shows_it(tmp_path, dxlrun):
         "position, limp",
         "position",
     ]
-
-
-def test_all_joints_off_and_on_again_and_again(start):
-    run = start(seconds=3.0)
-    joints = ["shoulder", "elbow", "wrist"]
-    numbers = [
-        run.ask(ms, torque(joints, on=bool(index % 2), release=True))
-        for index, ms in enumerate((400, 420, 430, 900, 1500, 1510, 1520, 2300))
-    ]
-    log = run.run()
-    assert run.is_done(numbers[3], numbers[-1])  # only a newer request makes an older one fail
-    assert all(torque_of(log, joint)[-1] is Torque.ON for joint in joints)
 
 
 @pytest.mark.parametrize("requested", [True, False])
@@ -197,36 +124,6 @@ def test_a_requested_reboot_is_no_fault_of_the_run(start, requested):
     else:
         assert (verdict.good, totals.invalid[2]) == (False, away)
         assert "wrist" in verdict.sentences[0]
-
-
-def test_a_reboot_that_never_ends_is_a_loss(start):
-    run = start(seconds=5.0)
-    run.fault("silence servo=3 at=500ms for=10s")
-    number = run.ask(400, reboot("wrist"))
-    log = run.run()
-    said = "wrist (ID 3 on bus main) did not answer within 3 s after its reboot"
-    assert refusal(run, number).startswith(said)
-    assert torque_of(log, "wrist")[:3] == [Torque.ON, Torque.REBOOTING, Torque.LOST]
-    totals = totals_of(run.path)
-    assert 140 < totals.invalid[2] < 180  # of the end, not of the three seconds before
-    assert not judge_run(totals).good
-
-
-def test_joint_holds_where_it_is_when_torque_is_requested_under_an_active_controller(start):
-    """A servo that rebooted is turned by hand and gets torque: the old command does not move it."""
-    run = start(seconds=2.5)
-    run.at(400, run.servos["elbow"].reboot)
-    run.at(1200, lambda: turn_by_hand(run.servos["elbow"], 2.5))
-    run.ask(1400, torque(["elbow"], on=True))
-    log = run.run()
-    assert run.is_done()
-    assert torque_of(log, "elbow")[-1] is Torque.ON
-    arm = [plan.name for plan in log.controllers].index("arm")
-    assert (log.cycles["active"] >> np.uint64(arm) & np.uint64(1)).all()
-    given = (log.cycles["torque"][:, 1] == Torque.ON) & (log.cycles["cycle"] > 100)
-    first = int(np.flatnonzero(given)[0])
-    for name in ("goal_position", "position"):
-        assert np.abs(log.cycles[name][first:, 1] - PUT).max() < 0.005
 
 
 PLAYER = ROBOT.replace(

@@ -7,7 +7,6 @@ import math
 from typing import Any
 
 import pytest
-from tests.kit.line_faults import truncate_next
 from tests.kit.sampled_run import SampledRun, texts
 from tests.kit.stories import send, switch
 
@@ -41,13 +40,6 @@ GONE_NS, BACK_NS = 500_000_000, 1_500_000_000
 def sway(controller: Any, time_ns: int) -> None:
     """Move all joints of a controller, 3 rad/s at the most."""
     controller.context.commands.position[:] = math.sin(3 * time_ns * 1e-9)
-
-
-def give_up(controller: Any, time_ns: int) -> None:
-    """Break the contract after a while."""
-    if time_ns >= GONE_NS:
-        raise ValueError(f"{controller.context.name} gave up")
-    sway(controller, time_ns)
 
 
 @pytest.fixture
@@ -94,13 +86,6 @@ def test_controllers_of_a_lost_servo_are_held_then_go_on_slowly_and_the_others_a
         assert largest_step(goals(run, "yaw", begin_ns, end_ns)) > 1.5 * 0.02 + TICK, "yaw was slowed down"
 
 
-def test_two_missed_replies_hold_no_joint(built, acts):
-    acts |= {"pair": sway}
-    run = built(1.0)
-    run.at(GONE_NS / 1e6, lambda: [truncate_next(run.bus, 7, 0) for _ in range(2)])
-    assert texts(run.run(), EventCode.POLICY) == []
-
-
 def test_a_command_does_not_wake_a_controller_whose_servo_is_lost(built):
     run = built(1.2)
     lose_tilt(run)
@@ -120,26 +105,6 @@ def test_a_controller_that_is_activated_while_its_servo_is_lost_waits_for_it_too
     assert run.is_done()
     assert swing(goals(run, "pan", GONE_NS, BACK_NS)) == 0
     assert swing(goals(run, "pan", BACK_NS)) > 0.5
-
-
-def test_a_fallback_takes_over_in_the_same_cycle_and_the_run_goes_on(built, acts):
-    taken: list[int] = []
-    acts |= {"pair": give_up, "calm": lambda controller, time_ns: taken.append(time_ns)}
-    run = built(1.0)
-    log = run.run()
-    masks = log.cycles["active"].tolist()
-    assert {mask & 0b1010 for mask in masks} == {0b0010, 0b1000}
-    fault = next(event for event in log.events if event.code == EventCode.CONTROLLER_FAULT)
-    assert (fault.source, "pair gave up" in fault.text) == ("pair", True)
-    assert swing(goals(run, "pan", GONE_NS + 3 * PERIOD_NS)) < 2 * TICK
-    assert taken
-
-
-def test_two_that_fall_back_on_each_other_end_the_run_when_both_have_failed(built, acts):
-    acts |= {"pair": give_up, "calm": give_up}
-    result = built(1.0).robot.run()
-    assert result.reason == "fault"
-    assert "calm gave up" in result.detail
 
 
 def test_no_controller_takes_over_from_one_that_fails_while_it_leaves(built, monkeypatch):

@@ -92,12 +92,3 @@ def test_the_home_directory_is_meant_by_a_tilde(tmp_path, monkeypatch):
     assert new_log(RecordingPlan(str(Path("~/logs"))), "pair").parent == tmp_path / "logs"
     with pytest.raises(InputError, match="write its absolute path"):
         new_log(RecordingPlan(str(Path("~nobody_of_this_name/logs"))), "pair")
-
-
-def test_runs_that_start_together_all_have_their_log(start, tmp_path):
-    runs = [start("--duration", "0.3") for _ in range(3)]
-    ends = [run.finish() for run in runs]
-    # 1: three runs at once on a busy machine may skip more of their few periods than they tolerate
-    assert all(code in (0, 1) and not err for code, _, err in ends), ends
-    assert len(list((tmp_path / "logs").glob("*.mcap"))) == 3
-    assert all(path.stat().st_size for path in (tmp_path / "logs").iterdir())

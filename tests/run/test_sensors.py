@@ -20,10 +20,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from tests.kit.awaited import DEADLINE_S, until
-from tests.kit.campaigns import campaign
 from tests.kit.packages import plugin_folder
 
 from dxlrun.channels import slot
@@ -34,7 +32,6 @@ from dxlrun.channels.slot import SlotReader, SlotState
 from dxlrun.control.controllers.plugin_loading import load_plugins
 from dxlrun.control.sampled_sources import PlannedProcess, ReaderContext, SourceContext, planned_processes
 from dxlrun.errors import PortError
-from dxlrun.features.sensors.events import SensorEvent
 from dxlrun.features.sensors.reader import Readings
 from dxlrun.plan.robot_plan import Plan
 from dxlrun.process_table import found_runs
@@ -111,19 +108,6 @@ def start_only(plan: Plan, memory: RunMemory) -> Any:
     return start_source(plan, only_process(plan), memory)
 
 
-def sensor_of(run: Any, port: str) -> int | None:
-    """Return the process that has the unit's port open."""
-    for path in Path("/proc").glob("[0-9]*"):
-        with suppress(OSError):
-            if run.mark.encode() not in (path / "environ").read_bytes():
-                continue
-            if b"run.source_process" in (path / "cmdline").read_bytes() and port in {
-                os.readlink(each) for each in (path / "fd").iterdir()
-            }:
-                return int(path.name)
-    return None
-
-
 def test_a_sensor_that_dies_sends_nan_or_stops_and_comes_back(tmp_path, unit, monkeypatch):
     monkeypatch.setattr(supervisor, "_RESTART_S", 0.1)
     plan = plan_with(tmp_path, SENSORS.format(port=unit.port))
@@ -179,64 +163,6 @@ def test_a_sensor_that_dies_sends_nan_or_stops_and_comes_back(tmp_path, unit, mo
     ]
     assert len(events) == 6
     assert events[5].startswith("delivered no sample for 1")
-
-
-@campaign(ci=0, night=5, release=20)
-def test_a_sensor_that_dies_sends_nan_or_stops_costs_the_run_nothing_but_its_row(
-    start, tmp_path, unit, number
-):
-    def wait_for(look):
-        def lives():
-            assert run.process.poll() is None, run.finish()
-
-        return until(look, check=lives, pause_s=0.2)
-
-    def wait_for_events(count):
-        wait_for(lambda: sum(event.source == "imu" for event in run.log().events) >= count)
-
-    robot = tmp_path / "pair.yaml"
-    text = robot.read_text().replace("name: pair", "name: pair_imu")
-    robot.write_text(text + SENSORS.format(port=unit.port))
-    run = start()
-    run.wait_until_moving()
-    first = wait_for(lambda: sensor_of(run, unit.port))
-    os.kill(first, signal.SIGKILL)
-    unit.line = b"0.5,9.81\n"  # the same values for so long would be those of a stuck sensor
-    wait_for_events(3)
-    unit.line = b"nan,9.81\n"
-    wait_for_events(4)
-    unit.line = b"0.75,9.81\n"
-    wait_for_events(5)
-    time.sleep(0.3)  # some samples
-    unit.line = None
-    wait_for_events(6)
-    run.signal(signal.SIGINT)
-    code, out, err = run.finish()
-    assert code == 1, out + err  # it is no good run: errors were logged
-    assert "The states of all joints were valid in every cycle" in out
-    assert run.gone()
-    log = run.log()
-    found = [(event.code, event.text) for event in log.events if event.source == "imu"]
-    ended = "sensor imu: its process exited (signal SIGKILL) and is restarted"
-    nan = "sensor imu: angular_velocity.z is nan; its values are not used"
-    expected = [
-        (SensorEvent.SENSOR, ended),
-        (SensorEvent.SENSOR_LOST, "sensor imu has failed; its values are not valid"),
-        (SensorEvent.SENSOR_BACK, "sensor imu delivers samples again"),
-        (SensorEvent.SENSOR_LOST, nan),
-        (SensorEvent.SENSOR_BACK, "sensor imu delivers samples again"),
-    ]
-    assert found[:-1] == expected
-    assert found[-1][0] == SensorEvent.SENSOR_LOST
-    assert found[-1][1].startswith("sensor imu delivered no sample for 1")
-    cycles = log.cycles
-    valid = cycles["source_valid"][:, 0]
-    assert cycles["valid"].all()  # of the servos
-    assert set(np.unique(cycles["source_state"][:, 0]).tolist()) == {0.25, 0.5, 0.75}
-    assert np.isfinite(cycles["source_state"]).all()
-    assert valid[:20].any()
-    assert not valid[-5:].any()
-    assert cycles["source_age_ns"][-1, 0] > 1_000_000_000
 
 
 def test_a_device_that_is_not_there_at_the_start_is_a_sentence(tmp_path):

@@ -87,22 +87,6 @@ def test_the_head_obeys_its_commands(log_of_three_parts):
     assert speed == pytest.approx(-30 * pi / 180, rel=0.03)
 
 
-def test_a_silent_servo_is_invalid_with_an_age_and_no_other_is(tmp_path):
-    path = tmp_path / "run.mcap"
-    robot = simulated_robot(TORSO, duration_s=2.0, log=path)
-    robot.buses[0].at(1_000_000_000, lambda: robot.buses[0].servo(5).silence(True))
-    robot.run()
-    log = read_log(path)
-    elbow = log.joints.index("left_elbow_joint")
-    silent = log.cycles["woken_ns"] > 1_020_000_000
-    assert silent.sum() > 20
-    assert not log.cycles["valid"][silent, elbow].any()
-    assert (np.diff(log.cycles["age_ns"][silent, elbow]) > 15_000_000).all()
-    others = [row for row in range(8) if row != elbow]
-    assert log.cycles["valid"][:, others].all()
-    assert any("left_elbow_joint" in failure and "ID 5" in failure for failure in robot.failures)
-
-
 def test_virtual_time_refuses_a_real_port():
     plan = plan_of(TORSO, arguments={"port": "/dev/ttyUSB0"}, duration_s=1.0)
     with pytest.raises(InputError, match="port:=sim"):
