@@ -16,6 +16,11 @@ def dxlrun_features():
 """
 
 
+@pytest.fixture(autouse=True)
+def in_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
 @pytest.fixture
 def project(tmp_path: Path) -> Callable[..., Path]:
     """Return what writes a project with the feature NAME in `dxlrun_NAME`, which has these modules."""

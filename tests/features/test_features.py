@@ -45,10 +45,6 @@ def test_all_files_of_features_are_on_the_page_of_the_architecture():
     assert {name for name in files if f"| `{name}.py` |" not in page} == set()
 
 
-def test_feature_without_file_takes_no_part_in_stage():
-    assert Feature("empty", "dxlrun.messages").stage(CompileStage) is None
-
-
 def test_guardian_does_not_import_a_feature_of_one_module():
     code = (
         "import sys; from dxlrun.dynamixel.bus_part import SafeEnd; from dxlrun.features import FEATURES; "

@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 from msgspec import structs
 from tests.kit.rigs import Events
+from tests.kit.robots import compile_text, problems_in
 
-from dxlrun import InputError
 from dxlrun.channels.cycle import Commands, States
 from dxlrun.cli import check
-from dxlrun.compile.robot_compiler import CompiledRobot, compile_files
 from dxlrun.description.joints import joint_forms
 from dxlrun.description.joints.joint_forms import kind_of_joint
 from dxlrun.description.json_schema import robot_schema
@@ -50,48 +49,39 @@ def with_backlash(project: Callable[..., Path]) -> Iterator[None]:
     robot_form.cache_clear()
 
 
-def compiled(tmp_path: Path, text: str) -> CompiledRobot:
-    """Compile the text of a robot file."""
-    (tmp_path / "robot.yaml").write_text(text)
-    return compile_files(tmp_path / "robot.yaml", {}, [])
-
-
 def mechanics_with_backlash() -> str:
     """Return a robot with a coupled joint that has the key."""
     text = (ROBOTS / "mechanics.yaml").read_text().replace("model: {urdf: urdf/mechanics.urdf}\n", "")
     return re.sub(r"(wrist_roll: *\{)", r"\1backlash: 1 deg, ", text)
 
 
-def problems(tmp_path: Path, text: str) -> str:
-    """Return what is wrong with the text of a robot file."""
-    with pytest.raises(InputError) as error:
-        compiled(tmp_path, text)
-    return str(error.value)
+def said(text: str) -> str:
+    return "".join(map(str, problems_in(text)))
 
 
-def test_value_is_in_the_plan_of_its_joint_only(tmp_path):
-    plan = compiled(tmp_path, ROBOT).plan
+def test_value_is_in_the_plan_of_its_joint_only():
+    plan = compile_text(ROBOT).plan
     assert [dict(joint.keys) for joint in plan.loop.joints] == [{"backlash": np.radians(4)}, {}]
     assert from_json(to_json(plan)) == plan
     assert plan.packages["dxlrun_backlash"] == "dxlrun-backlash"
 
 
-def test_groups_and_defaults_give_the_key_to_joints(tmp_path):
+def test_groups_and_defaults_give_the_key_to_joints():
     defaults = f"{ROBOT}joint_defaults: {{backlash: 1 deg}}\n"
-    assert [joint.keys["backlash"] for joint in compiled(tmp_path, defaults).plan.loop.joints] == [
+    assert [joint.keys["backlash"] for joint in compile_text(defaults).plan.loop.joints] == [
         pytest.approx(np.radians(4)),
         pytest.approx(np.radians(1)),
     ]
-    alone = compiled(tmp_path, defaults.replace("backlash: 4 deg", "torque: on")).plan
+    alone = compile_text(defaults.replace("backlash: 4 deg", "torque: on")).plan
     assert alone.packages["dxlrun_backlash"] == "dxlrun-backlash"
     groups = f"{ROBOT}groups: {{leg: {{joints: [ankle], backlash: 2 deg}}}}\n"
-    plan = compiled(tmp_path, groups.replace("backlash: 4 deg", "torque: on")).plan
+    plan = compile_text(groups.replace("backlash: 4 deg", "torque: on")).plan
     assert plan.loop.joints[1].keys["backlash"] == pytest.approx(np.radians(2))
     assert plan.packages["dxlrun_backlash"] == "dxlrun-backlash"
 
 
-def test_joint_of_a_transmission_may_have_the_key(tmp_path):
-    joints = compiled(tmp_path, mechanics_with_backlash()).plan.loop.joints
+def test_joint_of_a_transmission_may_have_the_key():
+    joints = compile_text(mechanics_with_backlash()).plan.loop.joints
     assert [joint.name for joint in joints if joint.keys] == ["wrist_roll"]
 
 
@@ -102,35 +92,31 @@ def test_key_with_a_name_like_a_key_of_servos_makes_no_joint_with_a_servo(monkey
     assert kind_of_joint({"lead": "1 mm"}) == "<no servo>"
 
 
-def test_layer_of_a_joint_key_is_above_the_servos_of_couplings(tmp_path):
-    plan = compiled(tmp_path, mechanics_with_backlash()).plan
+def test_layer_of_a_joint_key_is_above_the_servos_of_couplings():
+    plan = compile_text(mechanics_with_backlash()).plan
     joints, servos = len(plan.loop.joints), len(plan.mechanics.servos)
     layers = HardwareLayers(plan, States.empty(joints), Commands.empty(joints), Events())
     assert [len(layer.goals.position) for layer in layers._layers] == [joints, servos]
 
 
-def test_check_of_the_feature_names_the_place(tmp_path):
-    found = problems(tmp_path, ROBOT.replace("4 deg", "400 deg"))
+def test_check_of_the_feature_names_the_place():
+    found = said(ROBOT.replace("4 deg", "400 deg"))
     assert found.endswith("robot.yaml:6:87: the backlash of knee is outside its range; write less")
 
 
-def test_unit_of_the_other_kind_of_joint_is_refused(tmp_path):
+def test_unit_of_the_other_kind_of_joint_is_refused():
     slide = f"{ROBOT}  slide: {SLIDE % ', backlash: 1 deg'}\n"
-    assert "slide is linear, so its backlash cannot be in rad; write it as 0.2 mm" in problems(
-        tmp_path, slide
-    )
-    assert "so its backlash cannot be in m; write it as 0.5 deg" in problems(
-        tmp_path, ROBOT.replace("4 deg", "4 mm")
-    )
+    assert "slide is linear, so its backlash cannot be in rad; write it as 0.2 mm" in said(slide)
+    assert "so its backlash cannot be in m; write it as 0.5 deg" in said(ROBOT.replace("4 deg", "4 mm"))
 
 
-def test_unknown_word_is_compared_with_the_key(tmp_path):
-    assert "did you mean backlash?" in problems(tmp_path, ROBOT.replace("backlash", "baklash"))
+def test_unknown_word_is_compared_with_the_key():
+    assert "did you mean backlash?" in said(ROBOT.replace("backlash", "baklash"))
 
 
-def test_check_shows_the_key_as_a_column(tmp_path):
+def test_check_shows_the_key_as_a_column():
     slide = f"{ROBOT}  slide: {SLIDE % ', backlash: 0.1 mm'}\n"
-    found = compiled(tmp_path, slide)
+    found = compile_text(slide)
     assert [row["backlash"] for row in found.report["joints"]] == [np.radians(4), None, 1e-4]
     table = next(iter(check._tables(found)))
     column = [one.name for one in table.columns].index("backlash")
@@ -161,13 +147,13 @@ def test_check_shows_values_that_are_not_a_number(  # noqa: PLR0917  parameters
     assert written in capsys.readouterr().out
 
 
-def test_no_column_while_no_joint_has_the_key(tmp_path):
-    table = next(iter(check._tables(compiled(tmp_path, ROBOT.replace(", backlash: 4 deg", "")))))
+def test_no_column_while_no_joint_has_the_key():
+    table = next(iter(check._tables(compile_text(ROBOT.replace(", backlash: 4 deg", "")))))
     assert "backlash" not in [one.name for one in table.columns]
 
 
-def test_clients_of_a_run_get_the_key(tmp_path):
-    values = JointValues.from_joints(compiled(tmp_path, ROBOT).plan.loop.joints, {})
+def test_clients_of_a_run_get_the_key():
+    values = JointValues.from_joints(compile_text(ROBOT).plan.loop.joints, {})
     assert values.joint_keys == {"backlash": {"knee": np.radians(4)}}
 
 

@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from tests.kit.robots import compile_text
 
 from dxlrun import InputError
-from dxlrun.compile.robot_compiler import CompiledRobot, compile_files
 from dxlrun.description.json_schema import robot_schema
 from dxlrun.features import feature
 from dxlrun.testing import installed, simulated_robot
@@ -71,54 +71,47 @@ GLOWING = {1, 3, 5}
 
 @pytest.fixture(autouse=True)
 def with_glow(project: Callable[..., Path]) -> Iterator[None]:
-    """Install the package."""
     with installed(project("glow", servo_key=SERVO_KEY, settings=SETTINGS)):
         yield
 
 
-def compiled(tmp_path: Path, text: str) -> CompiledRobot:
-    """Compile the text of a robot file."""
-    (tmp_path / "robot.yaml").write_text(text)
-    return compile_files(tmp_path / "robot.yaml", {}, [])
-
-
-def test_each_servo_has_the_value_of_its_own_or_of_its_joint(tmp_path):
-    plan = compiled(tmp_path, ROBOT).plan
+def test_each_servo_has_the_value_of_its_own_or_of_its_joint():
+    plan = compile_text(ROBOT).plan
     assert {servo.servo_id for servo in plan.buses[0].servos if "led" in servo.declared} == GLOWING
     assert plan.buses[0].servos[0].declared == {"position_p_gain": 700, "led": 1}
     assert plan.packages["dxlrun_glow"] == "dxlrun-glow"
 
 
-def test_key_of_a_later_feature_counts(tmp_path):
+def test_key_of_a_later_feature_counts():
     text = ROBOT.replace("registers: {position_p_gain: 700}", "registers: {led: 0}")
-    settings = compiled(tmp_path, text).plan.buses[0].servos[0].settings
+    settings = compile_text(text).plan.buses[0].servos[0].settings
     assert [(one.name, one.value) for one in settings] == [("led", 1)]
 
 
-def test_robot_without_the_key_does_not_use_the_package(tmp_path):
+def test_robot_without_the_key_does_not_use_the_package():
     sys.modules.pop("dxlrun_glow.settings", None)
     feature._stage.cache_clear()
-    assert "dxlrun_glow" not in compiled(tmp_path, re.sub(", glow: (true|false)", "", ROBOT)).plan.packages
+    assert "dxlrun_glow" not in compile_text(re.sub(", glow: (true|false)", "", ROBOT)).plan.packages
     assert "dxlrun_glow.settings" not in sys.modules
 
 
-def test_mistake_has_the_place_of_the_key(tmp_path):
+def test_mistake_has_the_place_of_the_key():
     text = ROBOT.replace("id: 4, glow: false", "id: 4, glow: maybe")
     with pytest.raises(
         InputError, match=r"robot.yaml:10:42: joints.both.servos\[1\].glow is the text 'maybe'"
     ):
-        compiled(tmp_path, text)
+        compile_text(text)
 
 
-def test_setting_that_the_model_does_not_have_is_refused(tmp_path):
+def test_setting_that_the_model_does_not_have_is_refused():
     text = ROBOT.replace("id: 2}", "id: 2, model: PH42-020-S300-R, glow: true}")
     with pytest.raises(InputError, match="cannot glow"):
-        compiled(tmp_path, text)
+        compile_text(text)
 
 
-def test_joint_of_a_transmission_does_not_have_the_key(tmp_path):
+def test_joint_of_a_transmission_does_not_have_the_key():
     with pytest.raises(InputError, match="roll"):
-        compiled(tmp_path, ROBOT.replace("roll: {}", "roll: {glow: true}"))
+        compile_text(ROBOT.replace("roll: {}", "roll: {glow: true}"))
 
 
 def test_every_form_of_a_servo_is_in_the_schema():
