@@ -101,23 +101,6 @@ def test_a_fallback_comes_after_all_that_enter_in_its_cycle(slow):
     assert robot.result.reason == "fault"
 
 
-def test_a_fallback_of_a_lower_end_that_fails_as_it_is_taken_over_does_not_take_what_enters():
-    robot, position = Robot(joints=3), {"joints": ("j0", "j1"), "command": ("position",)}
-    robot.script("lower", fallback="greedy", reference=("position",), **position)
-    robot.script("upper", into=("lower",), **position, **OFF).script("beside", joints=("j2",), **OFF)
-    robot.script("greedy", **OFF)
-
-    def fails_to_follow():
-        def follow():
-            raise ControllerFault("controller lower raised in on_cancel")
-
-        robot.manager._named["lower"].follow_upper = follow
-
-    robot.run(8, {3: [fails_to_follow, robot.switches(["upper", "beside"])]})
-    assert robot.result.reason == "fault"
-    assert robot.active(3) == ["beside"]
-
-
 def test_a_chain_that_waits_is_given_up_when_an_active_lower_end_fails():
     robot = Robot(joints=3).script("ready", joints=("j0",), fallback="spare", reference=("position",))
     robot.script("slow", joints=("j1",), command=("position", "effort"), reference=("position",), **OFF)

@@ -16,18 +16,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from tests.hand.test_teach import points, positions
 from tests.kit.campaigns import campaign
-from tests.kit.hands import HandLine, LiveRobot, Script, written
+from tests.kit.hands import HandLine, Script, written
 
-from dxlrun import connect
 from dxlrun.compile.robot_compiler import compile_files
-from dxlrun.description.motion import read_motion
 from dxlrun.description.reading import read_robot
 from dxlrun_hand.commands.calibrate import calibrated
 from dxlrun_hand.commands.setup import set_up
 from dxlrun_hand.servo_setup import ServoSetup, factory_rate
-from dxlrun_hand.teaching import taught
 from dxlsim.simulation_plan import ServoConfig
 from dxlwire.control_table import ControlTable, find_table
 
@@ -197,51 +193,3 @@ def test_random_robots_are_set_up_and_calibrated(number: int, chance: random.Ran
             pytest.approx(one.lower, abs=0.15 + 3 * tick),
             pytest.approx(one.upper, abs=0.15 + 3 * tick),
         )
-
-
-@campaign(ci=0, night=10, release=50)
-def test_random_robots_are_taught(
-    number: int, chance: random.Random, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """In real time, with a run of its own; its limits are those of the servos."""
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    world = drawn(chance)
-    print(world.text)
-    unlimited = re.sub(r"(, |\n +)limits: [^}]*\}", "", world.text).replace("rate: 2}", "rate: 25}")
-    robot, target = (
-        written(tmp_path, re.sub(r"baud_rate: \d+", "baud_rate: 1000000", unlimited)),
-        tmp_path / "m.yaml",
-    )
-    with LiveRobot(tmp_path, robot) as live, connect() as running:
-        begins = positions(running)
-        plans = compile_files(robot, {}, []).plan.servos_by_joint
-        servos = {name: servo for name, ((_, servo),) in plans.items()}
-
-        def pose(answer: str) -> Callable[..., str]:
-            turns = {
-                f"id{servo.servo_id}": chance.choice((-1, 1)) * chance.uniform(5, 15)
-                for servo in servos.values()
-            }
-            for name, servo in servos.items():
-                shown[name] = shown[name] + servo.direction * turns[f"id{servo.servo_id}"]
-
-            def move(look: Callable[[], object]) -> str:
-                live.turn(look, 0.5, **turns)
-                return answer
-
-            return move
-
-        shown = dict(begins)
-        steps = [
-            ("become limp", ""),
-            ("taught", pose("")),
-            ("taught", pose("r")),
-            ("Recording", pose("")),
-            ("taught", "s"),
-        ]
-        script = Script(*steps, ("be switched on", ""), ("Play", "y"))
-        assert taught(running, script, (), target, 1.0) == 0, script.text
-        for name, position in positions(running).items():
-            assert position == pytest.approx(shown[name], abs=3.0)
-    for name, path in points(read_motion(target).motion).items():
-        assert path[-1][1] == pytest.approx(shown[name], abs=1.5)

@@ -22,7 +22,6 @@ from dxlrun.run import virtual_run
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun_analysis.replay import replay_log
 from dxlrun_controllers.group import (
-    JointGroupEffortController,
     JointGroupPositionController,
     JointGroupPosVelController,
     JointGroupVelocityController,
@@ -143,7 +142,6 @@ def test_servos_that_begin_to_disagree_in_the_run_are_one_event_until_they_agree
 
 CLASSES = {
     "velocity": JointGroupVelocityController,
-    "effort": JointGroupEffortController,
     "posvel": JointGroupPosVelController,
 }
 
@@ -177,20 +175,6 @@ def turned(plan, monkeypatch, tmp_path):
 VELOCITY = 0.229 * math.tau / 60  # rad/s a tick
 
 
-@pytest.mark.parametrize(
-    ("mode", "place", "expected"),
-    [
-        ("velocity", (104, VELOCITY), {2: 0.4, 3: -0.4, 5: 0.3, 6: -0.1}),
-        # an effort is shared: half of the hip's for each servo, half of sum and difference at the wrist
-        ("effort", (102, 0.00269), {2: 0.2, 3: -0.2, 5: 0.15, 6: -0.05}),
-    ],
-)
-def test_velocities_and_efforts_reach_both_servos_with_their_signs(turned, mode, place, expected):
-    # it ends before the gate lets a joint brake
-    sent = turned(mode, "hip, pitch, roll", "head, gripper", 0.15, place, **{mode: [0.4, 0.2, 0.1]})
-    assert sent == pytest.approx(expected, abs=place[1])
-
-
 SPEEDS = {1: 0.8, 7: 0.02 / 0.0942 * math.tau}
 """Of the servos, where the head turns at 0.4 rad/s and the gripper at 20 mm/s: 2 : 1, and 94.2 mm a turn."""
 
@@ -209,20 +193,6 @@ def test_the_speed_toward_a_position_is_the_servos_own(turned):
     goals = {"position": [0.2, 0.01], "velocity": [0.4, 0.02]}
     sent = turned("posvel", "head, gripper", "hip, pitch, roll", 0.2, place, **goals)
     assert {servo: sent[servo] for servo in SPEEDS} == pytest.approx(SPEEDS, abs=VELOCITY)
-
-
-@pytest.mark.parametrize("moved", [{2: 260}, {5: 260, 6: 100}])
-def test_joints_that_get_no_torque_may_stand_outside_their_limits(plan, moved):
-    limp = [(f"{joint}: {{", f"{joint}: {{torque: off, ") for joint in ("hip", "pitch", "roll")]
-    idle = (
-        "all: {type: joint_group_position_controller",
-        "all: {active: false, type: joint_group_position_controller",
-    )
-    robot = VirtualRobot(plan(*limp, idle, duration_s=0.3))
-    for servo, angle in moved.items():
-        turn_by_hand(robot.buses[0].servo(servo), math.radians(angle))
-    assert robot.run().reason == "ended"
-    assert not any(robot.buses[0].servo(servo).torque_on for servo in moved)
 
 
 def test_a_controller_for_one_joint_of_a_wrist_is_not_loaded_in_another_mode(plan):
@@ -334,16 +304,3 @@ def test_torque_off_at_one_joint_of_a_wrist_takes_the_controllers_of_both(plan, 
     assert isinstance(robot.inbox.answers[1], Completion)
     active = read_log(tmp_path / "run.mcap").cycles["active"]  # bits: states, all, up, around
     assert (int(active[10]), int(active[-1])) == (0b1111, 0b0011)
-
-
-def test_a_servo_that_shuts_itself_down_takes_the_torque_of_its_partner(plan, tmp_path):
-    robot = VirtualRobot(plan(), log=tmp_path / "run.mcap")
-    (bus,) = robot.buses
-    bus.at(400_000_000, bus.servo(2).power_cycle)
-    robot.run()
-    assert torque(robot, 3, 400_000_000, 900_000_000)[:1] == [0]
-    events = read_log(tmp_path / "run.mcap").events
-    texts = [event.text for event in events if event.code == EventCode.TORQUE_OFF]
-    assert any(
-        "hip: torque is switched off on ID 3 on bus main, as ID 2 on bus main of" in one for one in texts
-    )

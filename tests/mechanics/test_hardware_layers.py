@@ -13,7 +13,6 @@ from dxlrun import features
 from dxlrun.channels.cycle import Commands, States
 from dxlrun.channels.event_records import EventSink
 from dxlrun.contract.hardware import Hardware
-from dxlrun.dynamixel.dynamixel_hardware import DynamixelHardware
 from dxlrun.dynamixel.hardware_layer import HardwareLayer, HardwareLayers, LayerStage, PreparedLayer
 from dxlrun.features.feature import Feature, S
 from dxlrun.features.mechanics.joint_hardware import JointHardware
@@ -112,14 +111,3 @@ def test_layer_above_the_mechanics_has_rows_of_joints(with_offset, plan):
     assert isinstance(built, OffsetLayer)
     assert built.above is goals
     assert isinstance(built._hardware, JointHardware)
-
-
-def test_robot_without_layers_has_the_arrays_of_the_record(tmp_path):
-    path = tmp_path / "pair.yaml"
-    path.write_text(ROBOT)
-    robot = simulated_robot(path, duration_s=0.1)
-    hardware = robot.robot.hardware
-    assert isinstance(hardware, DynamixelHardware)
-    assert hardware._goals is robot.record.goals
-    assert hardware._states is robot.record.states
-    assert hardware._refusals is None

@@ -26,12 +26,6 @@ def arrays(plan):
     return found
 
 
-def test_servos_are_those_of_the_plan(plan):
-    mechanics = plan().mechanics
-    assert (mechanics.servo_rows(HIP), mechanics.servo_rows(PITCH)) == ((FIRST, SECOND), (LEFT, RIGHT))
-    assert mechanics.servos[LEFT] == "wrist/left"
-
-
 def test_random_goals_come_back_as_states(arrays):
     random = np.random.default_rng(7)
     for _ in range(200):
@@ -43,15 +37,6 @@ def test_random_goals_come_back_as_states(arrays):
         assert arrays.states.position == pytest.approx(goal, abs=1e-12)
         assert arrays.states.velocity == pytest.approx(goal, abs=1e-12)
         assert np.abs(arrays.residual).max() < 1e-12
-
-
-def test_a_differential_moves_both_by_sum_and_difference(arrays):
-    arrays.goals.position[:] = [0, 0, 0, 0.5, 0.2]
-    arrays.fill_servo_goals()
-    assert arrays.servo_goals.position[WRIST] == pytest.approx([0.7, 0.3])
-    arrays.servo_states.effort[WRIST] = 0.7, 0.3
-    arrays.fill_joint_states()
-    assert arrays.states.effort[[PITCH, ROLL]] == pytest.approx([1.0, 0.4])
 
 
 def test_power_is_the_same_on_both_sides(arrays):

@@ -127,19 +127,6 @@ def test_row_after_the_joints_is_the_register_of_a_single_servo(joints, servo):
     assert joints.answers == [("", 3), ("", 3)]
 
 
-def test_start_offset_of_two_servos_is_gone_after_one_second_of_writes(joints):
-    goals = joints.arrays.servo_goals.position
-    goals[:] = 0.0
-    goals[HIP_SERVOS] = 0.20, 0.24
-    joints.arrays.fill_joint_goals()
-    spread = []
-    for _ in range(50):  # 20 ms each
-        joints.hardware.write_goals()
-        spread.append(goals[2] - goals[1])
-    assert spread[24] == pytest.approx(0.02)
-    assert spread[49] == pytest.approx(0.0, abs=1e-9)
-
-
 @pytest.mark.parametrize("limp", [(1,), (2,), (1, 2)])
 def test_joint_gets_no_torque_at_the_start_outside_its_limits_unless_all_its_servos_are_to_be_limp(
     plan, limp

@@ -114,11 +114,6 @@ def test_gears_references_couplings_and_mimic_joints_move_links():
         assert getattr(geared.motion("tip"), name) == pytest.approx(expected, abs=1e-12)
 
 
-def test_an_unknown_link_is_a_key_error():
-    with pytest.raises(KeyError, match="nose"):
-        body_of(CRANE, ["turn"]).motion("nose")
-
-
 def test_the_body_in_another_process_moves_as_in_this_one():
     mechanics = Mechanics(0)
     for angle in (0.1, 0.2, -0.3):

@@ -15,9 +15,7 @@ from tests.kit.pages import page_text
 from dxlrun import SensorContext
 from dxlrun.cli import main
 from dxlrun.cli.examples import schema_text
-from dxlrun.control.sampled_sources import REOPEN_NS
 from dxlrun.features.sensors.offer import sensor_breach
-from dxlrun.run import source_process, supervisor
 
 ROOT = Path(__file__).parents[2]
 PAGE = page_text("sensors.md")
@@ -41,13 +39,6 @@ def test_it_has_the_table_of_keys_of_every_sensor():
     parts = {name for name in json.loads(schema_text("robot"))["$defs"] if name.startswith("sensor.")}
     assert len(parts) >= 5
     assert set(re.findall(r"^<!-- keys: (\S+) -->$", PAGE, re.MULTILINE)) == parts
-
-
-def test_its_times_are_those_of_the_program():
-    assert (REOPEN_NS, supervisor._RESTART_S, source_process.END_S) == (1_000_000_000, 2.0, 1.0)
-    assert "opened again each second" in PAGE
-    assert "started again after 2 s" in PAGE
-    assert "has 1 s to close" in PAGE
 
 
 def test_its_sensor_is_one(tmp_path, monkeypatch):

@@ -271,19 +271,6 @@ def test_joints_that_a_motion_does_not_move_get_no_correction() -> None:
     assert largest[1] == 0.0
 
 
-def test_a_motion_without_an_error() -> None:
-    def stay(learner: Learner) -> Learner:
-        learner.send(0.1, [{"time": t, "positions": [0.0, 0.0]} for t in (0.0, 1.0)])
-        learner.run(2.0)
-        return learner
-
-    learner = stay(Learner())
-    assert learner.stage.messages[-1][1].error == 0.0
-    again = Learner(kept=learner.stage.keeps[-1])
-    again.servos.position[:] = 0.5  # the arm is pushed
-    assert "nothing is learned" in stay(stay(again)).said[0]
-
-
 def test_each_motion_has_its_own_correction_and_the_oldest_is_forgotten() -> None:
     learner = Learner(motions=2)
     for phase in (0.0, 1.0):

@@ -301,30 +301,7 @@ def test_whenever_a_goal_takes_over_position_velocity_and_acceleration_continue(
         np.testing.assert_allclose(after[2], before[2], atol=1e-8)
 
 
-def test_a_goal_in_a_stop_while_the_speed_is_0_begins_with_the_velocity_of_then():
-    robot = started(ONE | POSVEL | {"deceleration": "2 rad/s^2"}, into=LOWER)
-    robot.send(0.0, "trajectory", points=one(1.3))
-    robot.update(0.5)
-    robot.cancel(0.5)
-    robot.change(0.6, speed=0.0)
-    robot.update(0.7)
-    robot.send(0.7, "trajectory", points=one(1.3))
-    _, speed = observed(robot, 0.7, 1.0)
-    assert speed[0, 0] == pytest.approx(1.0 - 2 * 0.2)
-    assert np.abs(np.diff(speed, axis=0)).max() < 0.02
-    assert speed[-1, 0] == 0.0
-
-
 # The speed
-
-
-def test_a_slower_speed_stretches_the_time_of_a_trajectory():
-    robot = started(ONE | POSVEL | {"speed": 0.5}, into=LOWER)
-    robot.send(0.0, "trajectory", points=points(np.linspace(0, 5, 200)), start_in=1.0)
-    for time in (2.5, 4.0, 7.3):
-        position, velocity = thesis(time / 2 - 1.0)
-        np.testing.assert_allclose(robot.update(time), position, atol=1e-4)
-        np.testing.assert_allclose(robot.commands.velocity, 0.5 * velocity, atol=2e-3)
 
 
 @pytest.mark.parametrize("period", [0.02, 0.001, 0.25])

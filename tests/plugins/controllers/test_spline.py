@@ -39,17 +39,6 @@ def test_the_peak_of_a_piece_is_that_of_its_roots(order):
             assert velocity(at) == pytest.approx(speed, rel=1e-9)
 
 
-@pytest.mark.parametrize(("order", "factor"), [(LINEAR, 1.0), (CUBIC, 3 / 2), (QUINTIC, 15 / 8)])
-def test_the_peak_from_rest_to_rest_is_a_known_factor_of_the_mean(order, factor):
-    ends = np.zeros((2, 3, 2))
-    ends[1, 0] = 0.4, -0.6
-    piece = np.zeros((order, 2))
-    solve(order, 0.5, *ends, piece)
-    found, times = peak_velocities(piece, 0.5)
-    np.testing.assert_allclose(found, np.array([0.8, -1.2]) * factor)
-    np.testing.assert_allclose(times, 0.5 if order == LINEAR else 0.25)
-
-
 @settings(max_examples=160, deadline=None)
 @given(
     order=st.sampled_from([CUBIC, QUINTIC]),
@@ -149,13 +138,6 @@ def test_a_bridge_from_a_motion_that_is_about_to_begin_keeps_its_velocity_of_non
     now.acceleration[:] = 0.9
     trajectory = loaded(LINEAR, np.array([1.0]), np.array([[[1.0], [0.0], [0.0]]]), 0.0, now)
     np.testing.assert_allclose(sampled(trajectory, [0.0], 1)[0, :, 0], [0.0, 0.0, 0.9])
-
-
-def test_after_the_end_the_last_position_is_held_at_rest():
-    points = np.array([[[1.0], [0.7], [0.2]], [[2.0], [0.6], [0.3]]])
-    trajectory = loaded(QUINTIC, np.array([0.5, 1.0]), points)
-    for time in (1.0, 1.5, 1e6):
-        np.testing.assert_array_equal(sampled(trajectory, [time], 1)[0, :, 0], [2.0, 0.0, 0.0])
 
 
 @settings(max_examples=80, deadline=None)

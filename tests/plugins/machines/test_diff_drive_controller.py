@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from tests.kit.stages import standing
 
 from dxlrun_controllers.diff_drive_controller import AngularLimits, DiffDriveController, LinearLimits, Ramp
-from dxlrun_controllers.laws.odometry import BasePose, WheelAngles
+from dxlrun_controllers.laws.odometry import WheelAngles
 
 SEPARATION, RADIUS = 0.16, 0.033
 BASE = {"left": ["l"], "right": ["r"], "separation": "160 mm", "radius": "33 mm"}
@@ -194,14 +194,6 @@ def test_odometry_is_the_exact_arc_of_exact_wheel_angles(arcs):
         pose += [cos * x - sin * y, sin * x + cos * y, angle]
     found = robot.controller._pose
     np.testing.assert_allclose([found.x, found.y, found.heading], pose, rtol=0, atol=1e-9)
-
-
-def test_small_and_large_angles_meet():
-    for angle in (9.9e-5, 1.01e-4, -1.01e-4, 2e-4, 1e-9):
-        pose = BasePose()
-        pose.move_along_arc(1.0, angle)
-        exact = on_arc(1.0, angle) if abs(angle) > 1e-6 else (1.0, angle / 2)
-        np.testing.assert_allclose([pose.x, pose.y], exact, rtol=0, atol=1e-12)
 
 
 def test_a_position_that_begins_anew_after_a_turn_is_followed():
