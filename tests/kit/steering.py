@@ -236,16 +236,21 @@ class Story(QueueInbox):
 
     def ask(self, kind: str, /, of: str = LOOP, lease_ns: int = 0, **data: Any) -> None:
         """Put a request for the loop into the inbox, or the command of a controller."""
-        self.count += 1
-        self.asked.append(self.count)
         try:
             raw = json.dumps(data).encode() if data else b""
             if of != LOOP:
                 raw = self.prepared(of, kind, raw or b"{}")
         except RefusedRequest as error:
+            self.count += 1
+            self.asked.append(self.count)
             self.answers[self.count] = error.refusal
         else:
-            self.waiting.append(CommandMessage(self.count, of, kind, raw, "anna", lease_ns))
+            self.post(kind, raw, of, lease_ns)
+
+    def post(self, kind: str, raw: bytes, of: str = LOOP, lease_ns: int = 0) -> None:
+        self.count += 1
+        self.asked.append(self.count)
+        self.waiting.append(CommandMessage(self.count, of, kind, raw, "anna", lease_ns))
 
     def prepared(self, controller: str, kind: str, body: bytes) -> bytes:
         """Return a command as the gateway hands it over; nothing where there is no such controller."""
@@ -393,6 +398,27 @@ def servo_action(name: str, *values: Any) -> Callable[[Story, str], None]:
     return lambda story, joint: getattr(story.servos[joint][0], name)(*values)
 
 
+def play(story: Story, text: str) -> None:
+    """Request a motion: `leg go 0=0.1 0.1=0.2 until 0.3, arm move 0=5`; a value may be missing."""
+    parts, values = [], []
+    for part in text.split(", "):
+        points, _, end_s = part.partition(" until ")
+        controller, kind, *pairs = points.split()
+        times = [float(pair.partition("=")[0]) for pair in pairs]
+        values += [float(value) for pair in pairs if (value := pair.partition("=")[2])]
+        parts.append(
+            {
+                "controller": controller,
+                "kind": kind,
+                "at_ns": [round(at_s * 1e9) for at_s in times],
+                "sizes": [1] * len(times),
+                "end_ns": round(float(end_s or 0) * 1e9),
+            }
+        )
+    head = json.dumps({"parts": parts}).encode()
+    story.post("play", head + b"\n" + np.array(values, dtype="<f8").tobytes())
+
+
 def command(story: Story, controller: str, kind: str, data: str, seconds: str | None) -> None:
     story.ask(kind, controller, round(float(seconds or 0) * 1e9), **yaml.safe_load(data or "{}"))
 
@@ -416,6 +442,7 @@ ACTIONS: dict[str, Callable[..., None]] = {
         "parameters", controller=name, values=yaml.safe_load(values)
     ),
     r"send (\w+) (\w+)(?: (\{.*\}))?(?: for (\S+) s)?": command,
+    r"play (.+)": play,
     r"(\w+) breaks(?: in (\w+))?": breaking,
     r"(\w+) requests (.+?)( and breaks)?: (.+)": requesting("take_over"),
     r"(\w+) ends the run: (.+)": requesting("end_run"),
