@@ -36,14 +36,11 @@ class Case(NamedTuple):
     kind: str  # Of the controller and its command
     goal: str  # The item that the register limits
     clamp: Clamp
+    title: str  # The register with its value, as events name it
 
     @property
     def protocol(self) -> float:
         return 1.0 if self.model == "AX-12A" else 2.0
-
-    @property
-    def title(self) -> str:
-        return TITLES[self.model, self.register]
 
     @property
     def raw(self) -> int:
@@ -51,41 +48,41 @@ class Case(NamedTuple):
         return int(self.title.partition(" = ")[2].partition(",")[0])
 
 
-TITLES = {
-    ("XM430-W350", "current_limit"): "Current Limit (38) = 20, 0.0538 A",
-    ("XM430-W350", "velocity_limit"): "Velocity Limit (44) = 50, 68.7 deg/s",
-    ("XM430-W350", "pwm_limit"): "PWM Limit (36) = 200, 22.6 %",
-    ("XL430-W250", "velocity_limit"): "Velocity Limit (44) = 50, 68.7 deg/s",
-    ("PH42-020-S300", "current_limit"): "Current Limit (38) = 100, 0.1 A",
-    ("PH42-020-S300", "velocity_limit"): "Velocity Limit (44) = 600, 36.0 deg/s",
-    ("H42-20-S300-R", "torque_limit"): "Torque Limit (30) = 40, 0.161 A",
-    ("YM070-210-R051", "current_limit"): "Current Limit (66) = 30, 0.3 A",
-    ("AX-12A", "max_torque"): "Max Torque (14) = 300, 29.3 %",
-}
-"""Model and register -> the register with its value, as events name it"""
+CURRENT, VELOCITY = "Current Limit (38) = 20, 0.0538 A", "Velocity Limit (44) = 50, 68.7 deg/s"
+PRO = "Velocity Limit (44) = 600, 36.0 deg/s"
 CASES = (
-    Case("XM430-W350", "current_limit", "effort", "goal_current", Clamp.EFFORT),
-    Case("XM430-W350", "current_limit", "poseffort", "goal_current", Clamp.EFFORT),
-    Case("XM430-W350", "velocity_limit", "velocity", "goal_velocity", Clamp.VELOCITY),
-    Case("XM430-W350", "velocity_limit", "posvel", "profile_velocity", Clamp.VELOCITY),
-    Case("XM430-W350", "pwm_limit", "pwm", "goal_pwm", Clamp.PWM),
-    Case("XL430-W250", "velocity_limit", "velocity", "goal_velocity", Clamp.VELOCITY),
-    Case("PH42-020-S300", "current_limit", "effort", "goal_current", Clamp.EFFORT),
-    Case("PH42-020-S300", "velocity_limit", "posvel", "profile_velocity", Clamp.VELOCITY),
-    Case("H42-20-S300-R", "torque_limit", "effort", "goal_torque", Clamp.EFFORT),
-    Case("YM070-210-R051", "current_limit", "effort", "goal_current", Clamp.EFFORT),
-    Case("AX-12A", "max_torque", "poseffort", "torque_limit", Clamp.EFFORT),
-)
-COMMANDS = {
-    "effort": ("efforts", lambda value: (value,)),
-    "velocity": ("velocities", lambda value: (value,)),
-    "pwm": ("pwm", lambda value: (value,)),
-    "posvel": ("posvel", lambda value: (0.01, value)),
-    "poseffort": ("poseffort", lambda value: (0.01, value)),
-}
-"""Name of the command, and its values for a limited one"""
-every_case = pytest.mark.parametrize(
-    "case", CASES, ids=lambda case: f"{case.model} {case.register} {case.kind}"
+    Case("XM430-W350", "current_limit", "effort", "goal_current", Clamp.EFFORT, CURRENT),
+    Case("XM430-W350", "current_limit", "poseffort", "goal_current", Clamp.EFFORT, CURRENT),
+    Case("XM430-W350", "velocity_limit", "velocity", "goal_velocity", Clamp.VELOCITY, VELOCITY),
+    Case("XM430-W350", "velocity_limit", "posvel", "profile_velocity", Clamp.VELOCITY, VELOCITY),
+    Case("XM430-W350", "pwm_limit", "pwm", "goal_pwm", Clamp.PWM, "PWM Limit (36) = 200, 22.6 %"),
+    Case("XL430-W250", "velocity_limit", "velocity", "goal_velocity", Clamp.VELOCITY, VELOCITY),
+    Case(
+        "PH42-020-S300",
+        "current_limit",
+        "effort",
+        "goal_current",
+        Clamp.EFFORT,
+        "Current Limit (38) = 100, 0.1 A",
+    ),
+    Case("PH42-020-S300", "velocity_limit", "posvel", "profile_velocity", Clamp.VELOCITY, PRO),
+    Case(
+        "H42-20-S300-R",
+        "torque_limit",
+        "effort",
+        "goal_torque",
+        Clamp.EFFORT,
+        "Torque Limit (30) = 40, 0.161 A",
+    ),
+    Case(
+        "YM070-210-R051",
+        "current_limit",
+        "effort",
+        "goal_current",
+        Clamp.EFFORT,
+        "Current Limit (66) = 30, 0.3 A",
+    ),
+    Case("AX-12A", "max_torque", "poseffort", "torque_limit", Clamp.EFFORT, "Max Torque (14) = 300, 29.3 %"),
 )
 
 
@@ -107,9 +104,9 @@ def run(case: Case, tmp_path: Path, share: float, limits: str = "limits: {positi
             registers["min_position_limit"], registers["max_position_limit"] = -1_000_000, 1_000_000
         robots.append(robot)
 
-    name, values = COMMANDS[case.kind]
-    value = limit_of(case, file) * share
-    story = {number: [send("c", name, *values(value))] for number in range(30, 34)}
+    command = {"effort": "efforts", "velocity": "velocities"}.get(case.kind, case.kind)
+    toward = [0.01] if case.kind.startswith("pos") else []
+    story = {number: [send("c", command, *toward, limit_of(case) * share)] for number in range(30, 34)}
     log = tell(file, story, tmp_path / "run.mcap", seconds=0.8, before=set_register)
     (robot,) = robots
     item = table.items[case.goal]
@@ -121,7 +118,7 @@ def run(case: Case, tmp_path: Path, share: float, limits: str = "limits: {positi
     return replayed(log), sent
 
 
-def limit_of(case: Case, file: Path) -> float:
+def limit_of(case: Case) -> float:
     """Return the limit in the unit of the command, as the servo's table has it."""
     table = find_table(case.model, case.protocol)
     if case.kind in {"velocity", "posvel"}:
@@ -131,28 +128,16 @@ def limit_of(case: Case, file: Path) -> float:
     return case.raw * (table.effort_per_tick if case.protocol == 2.0 else 1 / 1023)
 
 
-@every_case
-def test_a_goal_beyond_a_register_is_held_to_it_counted_and_named(case, tmp_path):
-    log, sent = run(case, tmp_path, 1.5)
-    assert max(map(abs, sent)) == case.raw
-    clamped = log.cycles["clamped"][:, 0]
-    assert (clamped & case.clamp).any()
-    texts = [event.text for event in log.events if event.code == EventCode.GATE]
-    held = [text for text in texts if "clamped by register" in text]
-    assert [text.lower() for text in held] == [
-        f"a, controller c: goal clamped by register {case.title}".lower()
-    ]
-
-
-@every_case
-def test_a_goal_within_a_register_is_not_reported(case, tmp_path):
-    log, sent = run(case, tmp_path, 0.9)
-    assert sent
-    assert max(map(abs, sent)) <= case.raw
-    assert not (log.cycles["clamped"][:, 0] & case.clamp).any()
-    assert [
-        event.text for event in log.events if event.code == EventCode.GATE and "register" in event.text
-    ] == []
+@pytest.mark.parametrize(("share", "held"), [(1.5, True), (0.9, False)])
+@pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case.model} {case.register} {case.kind}")
+def test_only_a_goal_beyond_a_register_is_held_to_it_counted_and_named(case, share, held, tmp_path):
+    log, sent = run(case, tmp_path, share)
+    highest = max(map(abs, sent))
+    assert highest == case.raw if held else highest <= case.raw
+    assert (log.cycles["clamped"][:, 0] & case.clamp).any() == held
+    texts = [event.text.lower() for event in log.events if event.code == EventCode.GATE]
+    expected = [f"a, controller c: goal clamped by register {case.title}".lower()]
+    assert [text for text in texts if "register" in text] == expected * held
 
 
 @pytest.mark.parametrize(("share", "held"), [(0.75, True), (0.45, False)])

@@ -41,12 +41,6 @@ def test_the_wheels_do_not_share_a_file(wheels: Path) -> None:
     assert any(name.endswith("licenses/LICENSE") for name in theirs)
 
 
-def test_its_own_test_passes(fresh: Shell, copy: Path) -> None:
-    told = fresh("python -m pytest -q -p no:cacheprovider", copy)
-    assert told.returncode == 0, told.stdout + told.stderr
-    assert " passed" in told.stdout
-
-
 @pytest.mark.parametrize("line", COMMANDS)
 def test_the_readmes_commands_end_well(fresh: Shell, copy: Path, line: str) -> None:
     told = fresh(line, copy)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,6 @@ import numpy as np
 import pytest
 
 from dxlrun.channels.event_records import EventCode
-from dxlrun.features.sensors.events import SensorEvent
 from dxlrun.log.log_reader import Log, read_log
 from dxlrun.testing import VirtualRobot, simulated_robot
 from dxlrun_analysis.replay import replay_log
@@ -95,41 +93,3 @@ def test_the_reduced_effort_is_on_the_wire_at_the_end_of_that_cycle(fall):
 
 def test_a_replay_has_no_difference(fall):
     assert replay_log(fall.path).same
-
-
-@pytest.mark.parametrize("on_silence", ["activate", "report"])
-@pytest.mark.parametrize("sticks", [True, False])
-def test_a_stuck_imu_is_a_failed_sensor(tmp_path, monkeypatch, on_silence, sticks):
-    """It falls while the IMU brings the sample of before again and again, with new times."""
-    files = tmp_path / "robots"
-    shutil.copytree(ROBOT.parent, files)
-    robot_file = files / "fall_reflex.yaml"
-    robot_file.write_text(
-        robot_file.read_text().replace("time: 30 ms}", f"time: 30 ms, on_silence: {on_silence}}}")
-    )
-    robot = simulated_robot(robot_file, duration_s=1.5, log=tmp_path / "run.mcap")
-    sensor = robot.drivers["torso_imu"]
-    read, kept = sensor.read, []
-
-    def stick(values: Any) -> int | None:
-        t_ns = read(values)
-        if sticks and robot.record.woken_ns > 500_000_000:
-            kept.append(values.copy())
-            values[:] = kept[0]
-        return t_ns
-
-    monkeypatch.setattr(sensor, "read", stick)
-    assert robot.run().detail == ""
-    log = read_log(tmp_path / "run.mcap")
-    took_over = [event.text for event in log.events if event.code == EventCode.TAKEOVER]
-    said = [event.text for event in log.events if event.source == "fall"]
-    silence = "no orientation from imu for 0.2 s"
-    assert took_over == (
-        [f"curl takes over from wave: {silence}"] if sticks and on_silence == "activate" else []
-    )
-    assert (f"{silence}: falls are not detected" in said) == (sticks and on_silence == "report")
-    lost = [event.text for event in log.events if event.code == SensorEvent.SENSOR_LOST]
-    assert [text[:36] for text in lost] == ["sensor torso_imu has returned the sa"] * sticks
-    # 0.2 s of equal samples; then the orientation becomes too old, and the reflex waits as long again
-    acted = [event.t_ns * 1e-9 for event in log.events if event.code == EventCode.TAKEOVER]
-    assert all(0.7 < time < 1.3 for time in acted)
