@@ -8,13 +8,11 @@ import pluggy
 from tests.kit.pages import page_text
 
 from dxlrun.contract.hookspecs import GROUP, HookSpecs
-from dxlrun.control import realtime_grants
 from dxlrun.control.schedule import MOST_CAUGHT_UP
 from dxlrun.description.robot import Scheduler
 from dxlrun.plan.loop_plan import OverrunPolicy
 
 PAGE = page_text("real-time.md")
-FLAT = " ".join(PAGE.split())
 
 
 def test_the_hook_of_the_page_is_one():
@@ -38,10 +36,3 @@ def test_every_request_is_on_the_page():
     assert Scheduler.model_fields
     for key in Scheduler.model_fields:
         assert f"`{key}`" in PAGE, key
-
-
-def test_the_numbers_of_polling_are_those_of_the_program():
-    assert (realtime_grants.AUTO_SHARE, realtime_grants.MOST_SHARE, realtime_grants._TRIES) == (10, 2, 32)
-    assert "sleeps 32 times" in FLAT
-    assert "at most a tenth of the period" in FLAT
-    assert "never more than half of the period" in FLAT
