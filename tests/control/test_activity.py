@@ -127,20 +127,6 @@ def page():
     return made
 
 
-def test_a_thread_that_no_hook_sees_is_counted_once_and_only_while_the_robot_runs(page):
-    threads = [1]
-    activity = Activity(page, lambda: threads[0])
-    started = []
-    for step, count in (
-        (ControllerMethod.ON_CONFIGURE, 2),
-        (ControllerMethod.UPDATE, 2),
-        (ControllerMethod.UPDATE, 4),
-        (ControllerMethod.UPDATE, 3),
-    ):
-        started.append(breach(activity, partial(threads.__setitem__, 0, count), step))
-    assert started == ["", "", f"started 2 threads {NEVER}", ""]
-
-
 @pytest.fixture
 def no_thread_ends():
     """Wait until the threads of earlier tests have ended: one that ends meanwhile hides one that begins."""

@@ -4,8 +4,6 @@ import numpy as np
 import pytest
 from tests.kit.loops import PERIOD_NS, Robot, commanding, following, on_update
 
-from dxlrun.errors import ControllerFault
-
 NAN = np.nan
 CHAINED = {"command": ("position",)}
 LOWER = CHAINED | {"reference": ("position",)}
@@ -33,17 +31,6 @@ def test_joints_of_both_ends_are_matched_by_their_names(joints):
     wanted = {f"j{row}": 0.1 * row + 0.1 for row in range(4)}
     robot.script("upper", commanding(position=[wanted[joint] for joint in joints]), joints=joints, **UPPER)
     assert first(robot) == [wanted[joint] if joint in joints else 0.25 for joint in robot.names]
-
-
-def test_two_controllers_meet_in_one_on_different_interfaces_of_a_joint(robot):
-    def sums(context, *_):
-        references = context.references
-        np.add(references.position, references.effort, out=context.commands.position)
-
-    robot.script("lower", on_update(sums), command=("position",), reference=("position", "effort"))
-    robot.script("path", commanding(position=0.25), **UPPER)
-    robot.script("gravity", commanding(effort=0.125), command=("effort",), into=("lower",))
-    assert first(robot) == [0.375, 0.375]
 
 
 def test_a_controller_sees_its_references_and_what_it_commands(robot):
@@ -81,18 +68,6 @@ def test_what_is_read_without_a_claim_is_of_this_cycle(robot):
     robot.run(1)
     here = float(states.position[1])
     np.testing.assert_allclose(seen[0], [0.3, here, 2.0, 0.003, NAN, 41.0, 0.5])
-
-
-def test_a_reference_that_none_or_two_of_those_below_export_cannot_be_commanded(robot):
-    robot.script("lower", joints=("j0",), **LOWER).script("upper", **UPPER)
-    with pytest.raises(ControllerFault, match="upper commands j1/position, but none of lower exports it"):
-        robot.build()
-    robot, one = Robot(), {"joints": ("j0",)}
-    for name in ("left", "right"):
-        robot.script(name, active=name == "left", **LOWER, **one)
-    robot.script("upper", into=("left", "right"), **CHAINED, **one)
-    with pytest.raises(ControllerFault, match="j0/position, but more than one of left, right exports"):
-        robot.build()
 
 
 def test_a_slower_controller_above_leaves_its_reference_in_between(robot):

@@ -33,18 +33,6 @@ def test_each_pair_that_claims_the_same_joints_is_named_once():
     )
 
 
-def test_a_reference_is_claimed_by_joint_and_interface():
-    found = conflicts(
-        [
-            wants("pid", ("a", "b")),
-            wants("arm", ("a", "b"), into=("pid",)),
-            wants("gravity", ("a", "b"), command=("effort",), into=("pid",)),
-            wants("whole", ("b", "c"), into=("other", "pid")),
-        ]
-    )
-    assert [str(conflict) for conflict in found] == ["controllers arm and whole both command pid/b/position"]
-
-
 def test_a_command_of_a_device_is_claimed_once():
     one, two = (wants(name, (), (), source_commands=("light/led",)) for name in ("one", "two"))
     (found,) = conflicts([one, two, wants("three", (), (), source_commands=("light/buzzer",))])

@@ -437,19 +437,6 @@ def test_a_joint_that_follows_its_velocity_never_passes_a_limit_nor_brakes_harde
 
 
 @SIDES
-def test_a_joint_that_is_driven_toward_its_limit_brakes_within_the_acceleration(side):
-    rig = rig_of(Mode.VELOCITY, acceleration=5.0)
-    place, speeds = 0.0, [0.0]
-    for _ in range(400):
-        place += speeds[-1] * 0.01
-        rig.states.position[:] = place
-        speeds.append(rig.apply(velocity=side * 9.0).velocity)
-    assert np.abs(np.diff(speeds)).max() == pytest.approx(0.05)
-    assert place == pytest.approx(side * 1.0, abs=1e-6)
-    assert max(np.abs(speeds)) > 1.5
-
-
-@SIDES
 def test_a_servo_that_lags_its_velocity_rests_at_the_limit_without_overshoot(side):
     rig = GateRig(Mode.VELOCITY, velocity=2.0, dt_ns=1_000_000)
     place = speed = 0.0

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from tests.kit.loops import Robot, commanding
 
-from dxlrun.channels.answers import Acceptance, Code, Completion, Refusal
+from dxlrun.channels.answers import Acceptance, Code, Refusal
 from dxlrun.channels.cycle import Torque
 from dxlrun.channels.event_records import EventCode
 from dxlrun.plan.policy_plan import SLOW_SPEED
@@ -73,32 +73,6 @@ def test_a_request_is_answered_when_all_servos_have_answered_by_what_went_wrong(
     assert story.what == [(0, False), (1, False), (2, False)]
     assert answers == [Acceptance(())] * 3
     assert story.answer() == (Code.TORQUE_NOT_SWITCHED, {"joint": ("j1",), "problem": why})
-
-
-def test_what_is_not_answered_at_the_end_of_the_run_is_refused_for_good(story):
-    story.run(5, {2: story.torques("j2")})
-    assert story.answer() == (Code.RUN_ENDING, {})
-    story.asked[0][-1]("")
-    assert story.answer() == (Code.RUN_ENDING, {})
-
-
-def test_a_register_is_answered_when_the_servo_has_it_and_not_before(story):
-    write = story.asks("register", joint="j1", item="p_gain", value=40)
-    read, answers = story.asks("get", joint="j1", item="p_gain"), []
-
-    def settled():
-        answers.append(dict(story.refusals))
-        story.asked[0][-1]("", 32)
-        story.asked[1][-1]("", 40)
-        story.asked[2][-1]("j1 did not answer", None)
-
-    story.run(6, {1: [write, read, read], 4: settled})
-    assert answers == [{}]
-    assert story.what[:2] == [(1, "p_gain", 40), (1, "p_gain")]
-    assert [story.answer(number) for number in (1, 2)] == [Completion(3, value=32), Completion(3, value=40)]
-    assert story.answer(3) == (Code.REGISTER_NOT_READ, {"problem": "j1 did not answer"})
-    text = '{"joint":"j1","item":"p_gain","value":40}'
-    assert (story.taken[0].cycle, story.taken[0].data_text) == (1, text)
 
 
 @pytest.mark.parametrize(

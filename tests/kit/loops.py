@@ -146,8 +146,6 @@ class Hardware:
     """Modes that were requested"""
     mode_cycles: Callable[[], int] = lambda: 0
     """How many cycles a joint takes to come into another mode"""
-    stubborn: tuple[int, ...] = ()
-    """Rows of joints that go back to position mode"""
     servo_limits: dict[int, tuple[ServoLimit, ...]] = field(default_factory=dict)
     """Registers that limit the servos, by row of the joint"""
     _coming: dict[int, tuple[int, int]] = field(default_factory=dict)
@@ -185,7 +183,7 @@ class Hardware:
         self._coming = {}
         for row in np.flatnonzero(modes).tolist():
             cycles = self.mode_cycles()
-            mode = Mode.POSITION if row in self.stubborn else int(modes[row])
+            mode = int(modes[row])
             self.record.states.mode[row] = Mode.UNKNOWN if cycles else mode
             if cycles:
                 self._coming[row] = (self._reads + cycles, mode)

@@ -5,14 +5,11 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from tests.kit.answers import read_answer
 from tests.kit.cases import read_cases
 
 from dxlrun.cli import main
@@ -77,20 +74,3 @@ def test_a_plugin_that_is_not_installed(printed: Printed) -> None:
     (line,) = printed(install=False)
     assert line.startswith(f"example.yaml:12:16: {NOT_OFFERED}")
     assert line.endswith("?") or "install its package in this environment" in line
-
-
-def test_the_same_for_programs_from_a_process_of_its_own(printed: Printed, tmp_path: Path) -> None:
-    printed("return 4", "return 7")
-    path = os.pathsep.join(filter(None, [str(tmp_path), os.environ.get("PYTHONPATH")]))
-    code = "import sys; from dxlrun.cli import main; sys.exit(main(sys.argv[1:]))"
-    check = subprocess.run(
-        [sys.executable, "-P", "-c", code, "check", "example.yaml", "--json"],
-        cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": path},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    (error,) = read_answer(check.stdout).errors
-    assert check.returncode == 2
-    assert (error.file, error.line, error.column) == ("example.yaml", 12, 16)

@@ -23,7 +23,6 @@ from dxlrun.contract.joint_controller import _TAKEN
 from dxlrun.control.controllers import single_files
 from dxlrun.control.controllers.plugin_loading import controller_breach
 from dxlrun.description.robot import ControllerEntry
-from dxlrun.log.identity import IDENTITY_NAME
 from dxlrun.remote.client import RemoteRobot
 from dxlrun.testing import plan_of, read_log, simulated_robot
 from dxlrun.tooling.runs import VirtualLink
@@ -69,18 +68,6 @@ def test_three_short_controllers_run_and_replay_bit_for_bit(tmp_path: Path) -> N
     assert np.ptp(sway) > 0.01  # the gyroscope is on the link that the wave moves
     assert np.isfinite(commands["command_effort"][:, 2:]).all()
     assert replay_log(log).sentence == "short: 100 cycles replayed, 0 differences"
-
-
-def test_the_log_has_the_file_and_a_replay_runs_the_same_one_on_the_disk(written: Written) -> None:
-    file, log = written(), Path("run.mcap")
-    simulated_robot(file, duration_s=0.3, log=log).run()
-    read = read_log(log)
-    assert read.attachments["included/wave.py"].decode() == WAVE
-    digest = read.metadata[IDENTITY_NAME]["included wave.py"]
-    assert read.metadata["plugins"]["./wave.py:Wave"] == f"wave.py {digest[:12]}"
-    for code in (None, "current", "log"):
-        report = replay_log(log, code=code)
-        assert (report.same, report.remarks) == (True, ())
 
 
 def test_code_of_a_log_is_executed_only_on_request(written: Written) -> None:

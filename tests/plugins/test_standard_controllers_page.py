@@ -21,15 +21,6 @@ TYPES = {name: section for name, section in SECTIONS.items() if name in OFFERS}
 RUNTIME_KEYS = {"type", "active", "rate", "fallback", "into"}
 
 
-def test_there_are_sections() -> None:
-    assert {"diff_drive_controller", "gripper_controller", "keyframe_player", "leader_follower"} <= set(TYPES)
-
-
-@pytest.mark.parametrize("name", TYPES)
-def test_a_section_has_a_table_of_the_keys(name: str) -> None:
-    assert re.search(rf"^<!-- keys: {name} -->$", TYPES[name], re.MULTILINE)
-
-
 def test_every_controller_and_each_of_its_keys_is_described() -> None:
     parts = json.loads(schema_text("robot", only="dxlrun "))["$defs"]
     named = {name for name in OFFERS if f"`{name}`" in PAGE or name in TYPES}

@@ -135,21 +135,6 @@ def check_limits(speeds: np.ndarray, fastest: float, acceleration: float) -> Non
     assert np.abs(np.diff(speeds, axis=0)).max() * RATE <= acceleration * (1 + 1e-6)
 
 
-def test_commands_that_jump_become_ramps_within_the_limits_of_the_joints(tmp_path):
-    jumps = [
-        Ask(1.5, "poses", "positions", {"positions": [-1.0, 1.2]}),
-        Ask(1.9, "poses", "positions", {"positions": [0.5, 0.0]}),
-    ]
-    limited = ARM.replace("velocity: 4 rad/s", "velocity: 1.5 rad/s, acceleration: 6 rad/s^2")
-    poses = "  poses: {type: joint_group_position_controller, joints: [elbow, shoulder]}"
-    run, _ = ran(tmp_path, poses, 4.0, jumps, limited)
-    goals = run.log.cycles["goal_position"]
-    velocity = np.diff(goals, axis=0) * RATE
-    assert np.abs(velocity).max(axis=0) == pytest.approx([1.5, 1.5], rel=0.02)
-    check_limits(velocity, 1.5, 6)
-    assert goals[-1].tolist() == [0.0, 0.5]
-
-
 @pytest.mark.parametrize("way", sorted(WAYS))
 def test_preempted_cancelled_and_waiting_it_stays_within_its_limits(tmp_path, way):
     tight = ARM.replace("100 deg", "60 deg").replace("1.2 A", "1.2 A, acceleration: 12 rad/s^2")

@@ -31,13 +31,6 @@ def test_every_robot_compiles_and_has_motions(path):
     assert path in {command_of(motion).robot for motion in MOTIONS} or path.stem in others
 
 
-@pytest.mark.parametrize("path", as_parameters(sorted({*ROBOTS.glob("*.yaml")} - {ROBOTS / "wave.yaml"})))
-def test_every_robot_asks_for_real_time(path):
-    """Of the kernel; the smallest example has no line for it. Without rights a run starts all the same."""
-    scheduler = compile_files(path, {}, []).plan.loop.scheduler
-    assert (scheduler.policy in {"round_robin", "fifo"}, scheduler.lock_memory) == (True, True)
-
-
 @pytest.mark.parametrize("path", as_parameters(MOTIONS))
 def test_every_motion_runs_by_the_command_that_it_names(path, tmp_path):
     command = command_of(path)

@@ -72,13 +72,6 @@ def test_a_motor_file_that_is_a_fifth_wrong_is_still_better_than_none(tmp_path):
         assert WITHOUT_RMS / 10 < found.rms < WITHOUT_RMS / 2
 
 
-def test_a_supply_of_eleven_volt_is_measured_and_made_up_for(tmp_path):
-    found, log = bench.tracked(tmp_path, WITH, bench.MX64, volts=11.0, seconds=SECONDS)
-    assert found.rms < WITHOUT_RMS / 10
-    supply = log.topics["/ff/state"].column("supply")
-    assert supply[-1] == pytest.approx(11.0, abs=0.1)
-
-
 def test_what_a_goal_takes_to_act_is_looked_ahead(tmp_path):
     slow = replace(bench.MX64, delay_ns=10_000_000)
     found, _ = bench.tracked(tmp_path, WITH, slow, seconds=SECONDS)

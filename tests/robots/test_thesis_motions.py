@@ -41,17 +41,6 @@ def test_a_step_of_the_position_alone_is_as_fast_as_the_servo_can(name, joint, m
     assert speed.max() == pytest.approx(fastest, rel=0.03)
 
 
-@pytest.mark.parametrize(("name", "joint", "model"), CASES)
-def test_a_step_with_a_speed_has_that_speed_all_the_way(name, joint, model, tmp_path):
-    t, q, speed = step(played(tmp_path, command_of(MOTIONS / f"{name}_posvel.yaml")), joint)
-    table = find_table(model, 1.0)
-
-    assert (q[0], q[-1]) == pytest.approx((-1.0, 1.0), abs=REST * table.rad_per_tick)
-    on_the_way = (q > -0.6) & (q < 0.9)  # by then it has come to its speed
-    assert np.polyfit(t[on_the_way], q[on_the_way], 1)[0] == pytest.approx(1.0, rel=0.02)
-    assert speed[on_the_way] == pytest.approx(1.0, abs=2 * table.rad_s_per_tick)
-
-
 def test_the_tracking_motion_keeps_its_time(tmp_path):
     """A motion that is sent by number, not by time, stretches: the thesis' old library by 5 s in 30 s."""
     run = played(tmp_path, command_of(MOTIONS / "single_joint_tracking.yaml"), 10.0)

@@ -75,50 +75,6 @@ def test_posvel_commands_the_magnitude_of_the_desired_velocity(velocities):
         np.testing.assert_allclose(robot.commands.velocity, abs(thesis(time - 1.0)[1]), atol=0.05)
 
 
-FULL = {"positions": [0.1], "velocities": [0.2], "accelerations": [0.3]}
-
-
-@pytest.mark.parametrize(
-    ("order", "missing"), [(6, ()), (4, ("accelerations",)), (2, ("velocities",))], ids=str
-)
-def test_what_all_points_give_decides_the_spline(order, missing):
-    second = {key: value for key, value in FULL.items() if key not in missing}
-    given_points = [FULL | {"time": 0}, second | {"time": 1}]
-    assert started().prepare("trajectory", points=given_points)[2] == order
-
-
-@pytest.mark.parametrize("interface", ["velocity", "effort"])
-def test_velocity_and_effort_follow_by_pid_and_feed_forward(interface):
-    gains = {"p": 3.0, "d": 0.5, "acceleration": 0.2, "friction": 0.1}
-    robot = started(ONE | {"command_interface": interface, "gains": gains})
-    command = getattr(robot.commands, interface)
-    robot.update(0.0, follow=False)
-    assert command[0] == 0.0
-    cubic = [{"time": t, "positions": [p], "velocities": [0.0]} for t, p in ((1, 0.3), (2, 1.3))]
-    robot.send(0.0, "trajectory", points=cubic)
-    robot.states.position[:], robot.states.velocity[:] = 0.4, 0.9
-    robot.update(1.25, follow=False)
-    t = 0.25
-    desired = 0.3 + 3 * t**2 - 2 * t**3, 6 * t - 6 * t**2, 6 - 12 * t
-    forward = desired[1] * (interface == "velocity") + 0.2 * desired[2] + 0.1
-    assert command[0] == pytest.approx(3.0 * (desired[0] - 0.4) + 0.5 * (desired[1] - 0.9) + forward)
-    assert np.isnan(robot.commands.position).all()
-
-
-@pytest.mark.parametrize(("interface", "limit"), [("velocity", 1.0), ("effort", 1.2)])
-def test_a_law_continues_with_what_was_sent_keeps_it_without_a_reply_and_ends_at_its_limit(interface, limit):
-    parameters = ONE | {"command_interface": interface, "gains": {"p": 1.0, "i": 50.0, "friction": 0.5}}
-    robot = Stage(JointTrajectoryController, parameters, limits={interface: limit})
-    getattr(robot.sent, interface)[:] = 0.7
-    command, sent = getattr(robot.activate().commands, interface), []
-    # 0.2 rad for 40 ms are 0.4, and p makes 0.2
-    for position, valid in ((0.3, True), (0.1, False), (0.1, True), (9.0, True)):
-        sent.append(command[0])
-        robot.states.position[:], robot.states.valid[:] = position, valid
-        robot.step()
-    assert [*sent, command[0]] == pytest.approx([0.7, 0.7, 0.7, limit, -limit])
-
-
 # Some joints
 
 ways = st.lists(

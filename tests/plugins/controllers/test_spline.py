@@ -91,23 +91,6 @@ def sampled(trajectory, times, joints):
     return np.array(found)
 
 
-@pytest.mark.parametrize("order", [LINEAR, CUBIC, QUINTIC])
-def test_a_whole_trajectory_is_scipys_between_its_points(order):
-    from scipy.interpolate import BPoly
-
-    random = np.random.default_rng(3)
-    times = np.cumsum(random.uniform(0.1, 1, 9))
-    points = random.uniform(-1, 1, (9, 3, 2))
-    trajectory = loaded(order, times, points)
-    at = np.linspace(times[0], times[-1], 200)[:-1]
-    found = sampled(trajectory, at, 2)
-    if order == LINEAR:
-        theirs = np.column_stack([np.interp(at, times, points[:, 0, joint]) for joint in range(2)])
-    else:
-        theirs = BPoly.from_derivatives(times, points[:, : order // 2])(at)
-    np.testing.assert_allclose(found[:, 0], theirs, atol=1e-12)
-
-
 def test_each_piece_is_by_what_both_its_points_give():
     times, points = np.array([0.0, 1.0, 2.0, 3.0]), np.zeros((4, 3, 1))
     points[:, 0, 0] = 0.0, 1.0, 2.0, 0.0
