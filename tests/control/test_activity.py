@@ -127,6 +127,17 @@ def page():
     return made
 
 
+def test_a_thread_that_no_hook_sees_is_counted_once_and_only_while_the_robot_runs(page):
+    threads = [1]
+    activity = Activity(page, lambda: threads[0])
+    steps = (ControllerMethod.ON_CONFIGURE, *[ControllerMethod.UPDATE] * 3)
+    started = [
+        breach(activity, partial(threads.__setitem__, 0, count), step)
+        for step, count in zip(steps, (2, 2, 4, 3), strict=True)
+    ]
+    assert started == ["", "", f"started 2 threads {NEVER}", ""]
+
+
 @pytest.fixture
 def no_thread_ends():
     """Wait until the threads of earlier tests have ended: one that ends meanwhile hides one that begins."""
