@@ -252,26 +252,9 @@ def test_message_in_one_of_the_two_only_is_a_difference(
     assert (first.cycle, first.recorded, first.replayed) == expected
 
 
-def test_messages_that_the_recorder_lost_are_a_remark(run: Callable[..., Path]) -> None:
-    def before(robot: VirtualRobot) -> None:
-        ring, dropped = robot.sinks.messages, []
-
-        class Lossy:
-            announce = staticmethod(ring.announce)
-
-            @staticmethod
-            def message(topic: int, t_ns: int, data: bytes) -> None:
-                dropped.append(t_ns)
-                if len(dropped) == 8:
-                    robot._writer.gap("loop/messages", 4)
-                if not 5 <= len(dropped) < 9:
-                    ring.message(topic, t_ns, data)
-
-        for managed in robot.robot.manager._managed:
-            for publisher in managed._topics._publishers.values():
-                publisher._sink = Lossy()
-
-    report = replay_log(run(before))
+def test_messages_that_the_recorder_lost_are_a_remark(pair_log: Path, changed: Changed) -> None:
+    lost = messages(STATE, lambda found: found.__delitem__(slice(4, 8)))
+    report = replay_log(changed(pair_log, lost, gaps=[("loop/messages", 4)]))
     assert report.same
     assert "the log lacks 4 messages of topics" in report.remarks
 

@@ -77,15 +77,6 @@ def test_silent_servo_and_periods_that_were_skipped(
     assert replay_log(changed(log, late_after_the_read)).same
 
 
-def test_run_that_ended_by_a_fault(tmp_path: Path, robot_file: Path) -> None:
-    robot, log = tmp_path / "faulty.yaml", tmp_path / "run.mcap"
-    robot.write_text(robot_file.read_text().replace("[tilt, nod]", "[tilt, nod], give_up_after: 0.5"))
-    result = simulated_robot(robot, duration_s=1.0, log=log).run()
-    assert (result.reason, result.cycles) == ("fault", 27)
-    report = replay_log(log)
-    assert (report.compared, report.same) == (27, True)
-
-
 def test_commands_from_outside_come_from_the_log(pair_log: Path, changed: Callable[..., Path]) -> None:
     (planned,) = recorded(read_log(pair_log)).plan.loop.commands
     by_value = command("trajectory", planned=-1, data=planned.data)
