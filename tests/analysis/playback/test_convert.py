@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from msgspec import structs
 from tests.kit.answers import result_of
 
 from dxlrun import ROTARY
@@ -68,48 +69,13 @@ def test_the_file_says_where_it_comes_from_and_is_never_written_over(
     assert [each.name for each in place.iterdir() if "2nd" in each.name] == ["2nd-try.yaml"]
 
 
-def test_controllers_of_single_positions_get_them_every_20_ms(
-    swing: Path, place: Path, dxlrun: Dxlrun
-) -> None:
-    text = (place / "pair.yaml").read_text()
-    entry = "{type: joint_trajectory_controller, joints: [pan, tilt]}"
-    groups = "{type: joint_group_position_controller, joints: [tilt]}\n"
-    groups += "  one: {type: joint_group_posvel_controller, joints: [pan]}"
-    (place / "groups.yaml").write_text(text.replace(entry, groups))
-    assert dxlrun("convert", swing, "first.yaml", "--what", "states", "--from", 2, "--to", 3).code == 0
-    # a log of that robot: its controllers are in the file
-    motion = (place / "first.yaml").read_text()
-    lines = [line for line in motion.splitlines() if "time:" in line]
-    for name, joint, speed in (("both", "tilt", False), ("one", "pan", True)):
-        lines_of = [_only(line, joint, speed=speed) for line in lines]
-        part = "\n".join([f"name: {name}", "motions:", f"  - controller: {name}", "    points:", *lines_of])
-        (place / f"{name}.yaml").write_text(part)
-    words = ["--play", "both.yaml", "--play", "one.yaml"]
-    assert dxlrun("groups.yaml", "--virtual", *words).code == 0
-    (log,) = place.glob("logs/*.mcap")
-    result = result_of(dxlrun("convert", log, "second.yaml", "--json").out)
-    # a position with a speed beside it is a destination: where the joint was is what is played
-    assert "goals of tilt; states of pan" in (place / "second.yaml").read_text().splitlines()[0]
-    assert set(result["points"]) == {"both", "one"}
-    parts = {part.controller: part for part in read_motion_file(place / "second.yaml").motion.motions}
-    for name, given in (("both", False), ("one", True)):
-        points = parts[name].points  # type: ignore[union-attr]  # of points
-        gaps = np.diff([point.time for point in points]) * 1e-9
-        assert points[0].time == 1_000_000_000
-        assert gaps.min() == pytest.approx(0.02, abs=0.001)
-        assert all(
-            (target.velocity is not None) == given for point in points for target in point.joints.values()
-        )
-    assert dxlrun("groups.yaml", "--virtual", "--play", "second.yaml").code == 0
-
-
-def test_posvel_joint_reaches_the_end_of_a_motion_that_becomes_slow() -> None:
+def test_controllers_of_single_positions_get_them_every_20_ms(tmp_path: Path) -> None:
+    """A joint that becomes slow at the end gets a speed at which it still arrives."""
     time = np.linspace(0.0, 2.0, 101)
-    position = np.stack([0.5 * np.sin(time * np.pi / 4), np.zeros(101)], axis=1)  # at rest at its end
-    motion = RecordedMotion(
-        Path("log"), ("pan", "wheel"), ("states", "states"), time, position, 0.0, (ROTARY, ROTARY)
-    )
-    group = ControllerPlan(
+    position = np.stack([0.5 * np.sin(time * np.pi / 4), np.zeros(101), 0.3 * np.sin(time)], axis=1)
+    joints = ("pan", "wheel", "tilt")
+    motion = RecordedMotion(Path("log"), joints, ("states",) * 3, time, position, 0.0, (ROTARY,) * 3)
+    head = ControllerPlan(
         name="head",
         type="joint_group_posvel_controller",
         distribution="",
@@ -120,21 +86,18 @@ def test_posvel_joint_reaches_the_end_of_a_motion_that_becomes_slow() -> None:
         active=True,
         every=1,
     )
-    allowed = np.full(2, math.radians(0.5))
-
-    text = motion_file(
-        motion, allowed, Path("slow.yaml"), None, "", plans=[group], speeds={"pan": math.inf, "wheel": 0.2}
-    ).text
-
-    *_, last = [line for line in text.splitlines() if "time:" in line]
-    assert re.findall(r"velocity: ([^ ]+) rad/s", last) == ["0.500000", "0.200000"]
-
-
-def _only(line: str, joint: str, *, speed: bool) -> str:
-    time = re.findall(r"time: [^,]+", line)[0]
-    position = re.findall(rf"{joint}: {{position: ([^ ]+) rad", line)[0]
-    with_speed = ", velocity: 3 rad/s" if speed else ""
-    return f"      - {{{time}, joints: {{{joint}: {{position: {position} rad{with_speed}}}}}}}"
+    group = "joint_group_position_controller"
+    tail = structs.replace(head, name="tail", type=group, joints=("tilt",), command=("position",))
+    speeds = {"pan": math.inf, "wheel": 0.2, "tilt": math.inf}
+    allowed, file = np.full(3, math.radians(0.5)), tmp_path / "slow.yaml"
+    file.write_text(motion_file(motion, allowed, file, None, "", plans=[head, tail], speeds=speeds).text)
+    parts = {part.controller: part.points for part in read_motion_file(file).motion.motions}
+    for points in parts.values():
+        assert points[0].time == 1_000_000_000
+        assert np.diff([point.time for point in points]).min() == pytest.approx(20_000_000, abs=1_000_000)
+    assert {target.velocity for point in parts["tail"] for target in point.joints.values()} == {None}
+    last = parts["head"][-1].joints
+    assert (last["pan"].velocity, last["wheel"].velocity) == pytest.approx((0.5, 0.2))
 
 
 @pytest.mark.parametrize(
