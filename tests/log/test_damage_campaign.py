@@ -11,15 +11,10 @@ from __future__ import annotations
 
 import random
 import re
-import signal
-import subprocess
-import sys
 import tracemalloc
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
-from textwrap import dedent
 
 import pytest
 from mcap.records import Chunk
@@ -29,7 +24,7 @@ from tests.kit.campaigns import campaign
 from dxlrun.channels.logged_packets import PacketBatch
 from dxlrun.channels.ring import Handover, RecordKind
 from dxlrun.errors import LogError
-from dxlrun.log.log_reader import LogReader, open_log, read_log
+from dxlrun.log.log_reader import LogReader, open_log
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.schemas import LogHeader
 from dxlwire.packets import PacketKind
@@ -178,55 +173,3 @@ def test_a_wrong_length_takes_no_memory_and_costs_what_it_covers(
             assert set(found[0]) <= set(written.cycles)
             assert len(found[0]) >= (CHUNKS - 2) * CYCLES, (at, length, found[2].damage)
     assert most_memory() < MOST_MEMORY
-
-
-WRITER = """
-    import sys
-    from pathlib import Path
-    from dxlrun.log.part_writer import open_writer
-    from dxlrun.plan.recording_plan import RecordingPlan
-    from dxlrun.log.schemas import LogHeader
-    from dxlrun.channels.cycle import CycleLayout, CycleRecord
-    from dxlrun.channels.ring import RecordKind
-
-    split = int(sys.argv[2]) or None
-    header = LogHeader("r", ("a", "b"), ("main",), (), 10**6, 0)
-    log = open_writer(Path(sys.argv[1]), header, RecordingPlan(split_ns=split))
-    record = CycleRecord(CycleLayout(header.joints, ()))
-    for number in range(1_000_000):
-        record.cycle = number
-        record.scheduled_ns = record.woken_ns = record.written_ns = number * 10**6
-        print(number, flush=True)  # from here on it is handed to the recorder
-        log.write_record(RecordKind.CYCLE, bytes(record.raw))
-        if number % 50 == 49:
-            log.flush()
-            print("flushed", number, flush=True)
-            if split:
-                log.settle()
-"""
-
-
-@campaign(ci=3, night=20, release=100)
-@pytest.mark.parametrize("split_ns", [0, 300_000_000], ids=["one file", "parts"])
-def test_all_that_was_flushed_before_kill_9_is_read(
-    tmp_path: Path, split_ns: int, amount: float, chance: random.Random
-) -> None:
-    for number in range(int(amount)):
-        lines_read = chance.randrange(100, 1500)
-        print(f"kill after {lines_read} lines")
-        path = tmp_path / f"{number}.mcap"
-        command = [sys.executable, "-c", dedent(WRITER), str(path), str(split_ns)]
-        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as child:
-            assert child.stdout is not None
-            lines = list(islice(child.stdout, lines_read))
-            child.send_signal(signal.SIGKILL)
-            lines += child.stdout.readlines()
-        handed = sum(line.strip().isdigit() for line in lines)
-        flushed = max((int(line.split()[1]) + 1 for line in lines if line.startswith("flushed")), default=0)
-        if not flushed:
-            continue
-        log = read_log(path)
-        cycles = log.cycles["cycle"].tolist()
-        assert cycles == list(range(len(cycles)))
-        assert flushed <= len(cycles) <= handed
-        assert not log.complete

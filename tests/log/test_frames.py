@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import random
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,6 @@ from tests.kit.campaigns import campaign
 from tests.kit.decoded import decode_log
 
 from dxlrun.channels.cycle import CycleRecord
-from dxlrun.channels.ring import RecordKind
 from dxlrun.description.frames.tree import ORIENTATION, FramesPlan, FrameTree
 from dxlrun.log import schemas
 from dxlrun.log.log_reader import open_log
@@ -236,29 +235,13 @@ def test_quaternions_are_of_length_one_and_never_change_their_sign_at_once() -> 
             last[each.child_frame_id] = quaternion
 
 
-def test_the_stamp_is_when_the_states_were_read(
-    header: LogHeader, cycle: Callable[[int], bytes], path: Path
-) -> None:
-    joint, links = header.joints[0], '<link name="base"/><link name="arm"/>'
-    ends = '<parent link="base"/><child link="arm"/>'
-    urdf = f'<robot name="one">{links}<joint name="{joint}" type="continuous">{ends}</joint></robot>'
-    writer = LogWriter(path, replace(header, robot_description=urdf, frames=FramesPlan(1000, (joint,))))
-    data = cycle(3)
-    writer.write_record(RecordKind.CYCLE, data)
-    writer.close()
-    read_ns = int(np.frombuffer(data, header.layout.dtype)[0]["read_ns"]) + header.epoch_offset_ns
-    (one,) = decode_log(path, "/tf")
-    stamp = one.message.transforms[0].header.stamp
-    assert (one.t_ns, stamp.sec, stamp.nanosec) == (read_ns, *divmod(read_ns, 1_000_000_000))
-
-
 def test_a_robot_without_a_urdf_has_no_frames(header: LogHeader, path: Path) -> None:
     assert header.robot_description is None
     LogWriter(path, replace(header, frames=FramesPlan(30))).close()
     assert schemas.LogTopic.FRAMES not in open_log(path).topics
 
 
-# An IMU on a moving link, linear and mimic joints
+# An IMU on a moving link
 
 TILTING = """\
 <robot name="tilting"><link name="base_link"/><link name="arm"/><link name="imu_link"/>
@@ -266,13 +249,6 @@ TILTING = """\
 <axis xyz="0 1 0"/><limit lower="-2" upper="2" velocity="5" effort="1"/></joint>
 <joint name="mount" type="fixed"><parent link="arm"/><child link="imu_link"/>
 <origin xyz="0 0 0.05" rpy="0.4 0 0"/></joint></robot>
-"""
-JAW = """\
-<robot name="jaw"><link name="hand"/><link name="left"/><link name="right"/>
-<joint name="jaw" type="prismatic"><parent link="hand"/><child link="left"/><origin xyz="0 0.01 0"/>
-<axis xyz="0 1 0"/><limit lower="0" upper="0.03" velocity="0.1" effort="1"/></joint>
-<joint name="other" type="prismatic"><parent link="hand"/><child link="right"/><axis xyz="0 1 0"/>
-<mimic joint="jaw" multiplier="-1" offset="-0.01"/></joint></robot>
 """
 
 
@@ -284,11 +260,3 @@ def test_a_body_whose_imu_is_on_a_moving_link_stands_upright() -> None:
         found = transforms(scene.still) | transforms(scene.at({"tilt": angle}, tuple(measured.as_quat())))
         assert in_root("imu_link", found)[:3, :3] == pytest.approx(measured.as_matrix(), abs=1e-9)
         assert in_root("base_link", found)[:3, :3] == pytest.approx(np.eye(3), abs=1e-9)
-
-
-def test_a_linear_joint_and_the_one_that_mimics_it_move_by_metres() -> None:
-    scene = Scene(JAW, ("jaw",))
-    for way in (0.0, 0.015, 0.03):
-        found = transforms(scene.at({"jaw": way}))
-        assert found["hand", "left"][:3, 3] == pytest.approx([0, 0.01 + way, 0], abs=1e-9)
-        assert found["hand", "right"][:3, 3] == pytest.approx([0, -0.01 - way, 0], abs=1e-9)

@@ -99,14 +99,6 @@ def names(*parts: int) -> list[str]:
     return [f"part_{part:04d}.mcap" for part in parts]
 
 
-def test_without_split_a_log_is_one_file(start: Start) -> None:
-    run = start(RecordingPlan())
-    run.cycles(0, 10)
-    run.log.close()
-    assert run.folder.is_file()
-    assert PART_NAME not in read_log(run.folder).metadata
-
-
 def test_split_by_time_loses_nothing_and_reads_as_one(start: Start) -> None:
     run = start(EACH_SECOND)
     run.cycles(0, 175)

@@ -410,35 +410,6 @@ def hang_device(story: Story, servo_id: float) -> None:
     registers.show_live({name: partial(int, live()) for name, live in registers._live.items()})
 
 
-TORSO = """<robot name="torso"><link name="stand"/><link name="torso"><inertial><mass value="1"/>
-<inertia ixx="0.004" iyy="0.004" izz="0.002" ixy="0" ixz="0" iyz="0"/></inertial></link>
-<joint name="{joint}" type="revolute"><parent link="stand"/><child link="torso"/><axis xyz="0 1 0"/>
-<limit lower="-2.2" upper="2.2" effort="10" velocity="9"/></joint></robot>"""
-
-
-@line("<joint> tips a torso with an IMU", once)
-def tip_a_torso(story: Story, _: float, joint: str) -> None:
-    (story.directory / "torso.urdf").write_text(TORSO.format(joint=joint))
-    noise = {"gyroscope": {"noise_density": 1.0e-3}, "accelerometer": {"noise_density": 3.0e-3}}
-    gyro = {"type": "simulated_imu", "rate": story.kind.rate, "link": "torso"}
-    story.spec |= {"model": {"urdf": "torso.urdf", "frames_rate": 0}, "sensors": {"gyro": gyro | noise}}
-    broadcaster = {"type": "imu_sensor_broadcaster", "sensor": "gyro", "frame": "torso"}
-    story.spec["controllers"]["imu"] = broadcaster
-
-
-@line("the IMU gives the same sample", then)
-def hang_imu(story: Story) -> None:
-    driver, kept = story.virtual.drivers["gyro"], []
-
-    def hung(read: Act, values: Any) -> int:
-        t_ns: int = read(values)
-        kept[:] = kept or [values.copy()]
-        values[:] = kept[0]
-        return t_ns
-
-    instead(driver, "read", lambda read: partial(hung, read))
-
-
 # Controllers, the loop and the machine
 
 
