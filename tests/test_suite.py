@@ -36,7 +36,6 @@ def test_every_test_has_a_limit(pytestconfig: pytest.Config) -> None:
 
 CLOCKS = {"monotonic", "monotonic_ns", "perf_counter", "time", "time_ns"}
 DURATIONS = {
-    "tests/analysis/verdicts/live.py": "a process is stopped again and again, for moments",
     "tests/kit/awaited.py": "the deadline",
     "tests/kit/hands.py": "a hand turns a servo for so long",
     "tests/ros2/foreign.py": "runs in a ROS environment, without the kit",

@@ -93,10 +93,6 @@ class Case:
     finds: list[tuple[str, str]] | None = None
     unnamed: dict[str, str] = field(default_factory=dict)
 
-    @property
-    def is_live(self) -> bool:
-        return any(text.startswith("in real time: ") for *_, text in self.lines)
-
     def expect(self, text: str) -> None:
         """Read a line of what is expected."""
         if text in ("good", "not good"):

@@ -6,7 +6,6 @@ pattern of the rest gets the numbers and words of its groups, and is called when
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Callable
 from functools import partial
@@ -14,7 +13,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import yaml
-from tests.analysis.verdicts.live import compile_jobs, hog_on_the_core_of_the_loop, stop_for_moments
 from tests.analysis.verdicts.rig import JOINTS, MS, S, Story, instead
 from tests.kit.line_faults import other_host
 
@@ -129,23 +127,6 @@ def arrival(story: Story, text: str, since_s: float, joints: list[str], act: Act
 def wake(story: Story, text: str, since_s: float, joints: list[str], act: Act) -> None:
     """Let the loop wake later by act(story, ...), s; `story.count` is the number of the wake-up."""
     story.stall(text, since_s, act)
-
-
-def update(story: Story, text: str, since_s: float, joints: list[str], act: Act) -> None:
-    """Call act(story, ...) behind each update of the controller body."""
-
-    def broken(update: Act) -> Act:
-        def updated(time_ns: int, period_ns: int) -> None:
-            update(time_ns, period_ns)
-            if time_ns >= since_s * S:
-                story.evidence[text] += 1
-                act()
-
-        return updated
-
-    story.prepared.append(
-        lambda: instead(story.virtual.robot.loop.manager._named["body"].controller, "update", broken)
-    )
 
 
 def proof(story: Story, text: str, since_s: float, joints: list[str], act: Act) -> None:
@@ -359,19 +340,6 @@ def never_overload(story: Story, _: float, joint: str) -> None:
     shaft.mechanics.strain.overloaded[shaft.index] = 0
 
 
-@line("<joint> slips by <n> rad every <n> s", again)
-def slip(story: Story, _: float, joint: str, angle: float, period_s: float) -> None:
-    servo = story.servo(joint)
-    servo.shaft.mechanics.move_shaft(servo.shaft.index, servo.shaft_angle + angle)
-
-
-@line("<joint> is kicked to and fro by <n> rad/s every <n> s", again)
-def kick(story: Story, t_s: float, joint: str, speed: float, period_s: float) -> None:
-    shaft = story.servo(joint).shaft
-    shaft.mechanics.plant.velocity[shaft.index] += speed * (1 if int(t_s * 25) % 2 else -1)
-    shaft.mechanics._wake()
-
-
 @line("<joint> has a bag of <n> Nm to carry", then)
 def hang_a_bag(story: Story, joint: str, torque: float) -> None:
     shaft = story.servo(joint).shaft
@@ -401,27 +369,7 @@ def run_flat(story: Story, t_s: float, first: float, last: float, in_s: float) -
         servo.apply_protection()
 
 
-# Sensors and boards
-
-
-@line("the device ID <n> hangs", then)
-def hang_device(story: Story, servo_id: float) -> None:
-    registers = story.bus(0).device(int(servo_id)).registers
-    registers.show_live({name: partial(int, live()) for name, live in registers._live.items()})
-
-
-# Controllers, the loop and the machine
-
-
-@line("body raises an IndexError", update)
-def raise_an_error(story: Story) -> None:
-    raise IndexError("list index out of range")
-
-
-@line("every <n>th update of body takes <n> ms longer", update)
-def update_slowly(story: Story, each: float, ms: float) -> None:
-    if next(story.numbers) % each == 0:
-        story.virtual.clock.wait_until(story.virtual.clock.now_ns() + round(ms * MS))
+# The loop and the machine
 
 
 @line("every <n>th wake-up is <n> ms late(?:, after the first <n>)?", wake)
@@ -443,28 +391,6 @@ def wake_late_each_second(story: Story, for_s: float) -> float:
 @line("the loop stands still for <n> ms every <n> s", once)
 def stand_still(story: Story, since_s: float, ms: float, period_s: float) -> None:
     story.stand_still("still", since_s, round(ms * MS), round(period_s * S))
-
-
-@line("in real time: a program that never waits has the core of the loop", once)
-def hog(story: Story, _: float) -> None:
-    story.disturb = hog_on_the_core_of_the_loop
-
-
-@line("in real time: compilers run, one more than there are cores", once)
-def compile_beside(story: Story, _: float) -> None:
-    story.disturb = partial(compile_jobs, count=(os.cpu_count() or 1) + 1)
-
-
-@line(r"in real time: the (\w+) is stopped for <n> s every <n> s", once)
-def stop_a_process(story: Story, _: float, name: str, for_s: float, every_s: float) -> None:
-    story.disturb = partial(stop_for_moments, what=name, for_s=for_s, every_s=every_s)
-
-
-@line("the last third of the log is lost", proof)
-def cut_log(story: Story, log: Log, row: int) -> bool:
-    path = story.directory / "run.mcap"
-    os.truncate(path, path.stat().st_size * 2 // 3 - 7)
-    return True
 
 
 # Proof, by the log, the ledger and the start

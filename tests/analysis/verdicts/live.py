@@ -97,29 +97,3 @@ def hog_on_the_core_of_the_loop(run: Run) -> str:
     with hogging(core_of(loop)):
         run.wait(DEADLINE_S)
     return "hogged"
-
-
-class TooLongError(Exception):
-    """A process was stopped for much longer than it was to be: this program got no processor in between."""
-
-
-def stop_for_moments(run: Run, what: str, for_s: float, every_s: float) -> str:
-    """Stop a process of a run for moments, again and again, once the loop runs."""
-    pid = process_of(run, what)
-    assert pid, f"there is no {what}"
-    time.sleep(2.0)
-    times = 0
-    while run.poll() is None and Path(f"/proc/{pid}").exists():
-        began = time.monotonic()
-        try:
-            os.kill(pid, signal.SIGSTOP)
-            time.sleep(for_s)
-            os.kill(pid, signal.SIGCONT)
-        except ProcessLookupError:
-            break
-        if time.monotonic() - began > 2 * for_s:
-            raise TooLongError
-        times += 1
-        time.sleep(every_s)
-    assert times > 2, "it was over before it was stopped"
-    return "stopped"

@@ -19,7 +19,6 @@ from typing import Any
 
 import pytest
 from msgspec.structs import replace
-from tests.analysis.verdicts.live import TooLongError
 from tests.kit.awaited import DEADLINE_S
 
 from dxlrun.channels.commands import CommandMessage, QueueInbox
@@ -362,11 +361,6 @@ class Story:
             try:
                 self.evidence[disturb(process)] += 1
                 said, _ = process.communicate(timeout=DEADLINE_S)
-            except TooLongError:
-                process.kill()
-                for log in self.directory.glob("*.mcap"):
-                    log.unlink()
-                return self._run_live(file, played, disturb)
             finally:
                 process.kill()
         logs = list(self.directory.glob("*.mcap"))

@@ -1,8 +1,7 @@
 """Faults of robots on virtual time: a verdict names the cause and accuses no innocent. The cases are `*.txt`.
 
 Each number of the campaign draws a pair of a case and a robot; `--campaign=release` runs all pairs. Only it
-includes pairs that take real time, and pairs whose cause is known not to be named: such a pair has to stay
-unnamed, or lose that line.
+includes pairs whose cause is known not to be named: such a pair has to stay unnamed, or lose that line.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ pytestmark = pytest.mark.long
 HERE = Path(__file__).parent
 CASES = [*read_cases(*sorted({*HERE.glob("*.txt")} - {HERE / "losses.txt"}))]
 PAIRS = [(case, robot) for case in CASES for robot in case.robots]
-DRAWN = [(case, robot) for case, robot in PAIRS if not case.is_live and robot not in case.unnamed]
+DRAWN = [(case, robot) for case, robot in PAIRS if robot not in case.unnamed]
 LOSSES = list(read_cases(HERE / "losses.txt"))
 
 
