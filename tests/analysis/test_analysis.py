@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 from collections.abc import Callable
 from pathlib import Path
 from statistics import median
@@ -13,7 +12,6 @@ from rich.console import Console
 from tests.kit.made_logs import Cycle, Said, Wire
 
 from dxlrun.channels.event_records import EventCode, Severity
-from dxlrun.output.json import json_text
 from dxlrun.output.terminal import show_parts
 from dxlrun.output.text_table import Table, microseconds
 from dxlrun_analysis.parts.cycles import CONTROLLERS, STEPS
@@ -214,16 +212,6 @@ def test_errors_gaps_and_a_log_without_end_are_reported(write: Write) -> None:
 
 
 # What is shown
-
-
-def test_json_carries_the_whole_report(write: Write) -> None:
-    read = json.loads(json_text(analyze_log(write([Cycle(0)])).numbers))
-    assert read["verdict"]["good"] is True
-    counts = {"elapsed": 1, "records": 1, "skipped": 0, "missing": 0, "agree": True}
-    times = {"rate_hz": 50.0, "seconds": 0.02, "rates_hz": [50.0], "begin_ns": 1_000_000_000}
-    assert read["periods"] == counts | times
-    assert read["joints"][0]["name"] == "left_elbow_joint"
-    assert set(read["extremes"][0]) == {"joint", "hottest_c", "lowest_volts"}
 
 
 @pytest.mark.parametrize(("value", "text"), [(83.4, "83 us"), (16_949.0, "16.95 ms"), (2.5e6, "2.50 s")])

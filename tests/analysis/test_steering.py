@@ -81,14 +81,6 @@ def test_verdict_has_it(report: Report) -> None:
     )
 
 
-def test_tables_and_numbers_keep_their_orders(report: Report) -> None:
-    shown = list(tables(report))
-    assert shown == ["periods", "steps", "servos", "buses", "joints", "steering", "events"]
-    assert list(tables(report, "buses")) == ["buses", "servos"]
-    numbers = [name for name in report.numbers if name in shown]
-    assert numbers == ["periods", "steps", "servos", "buses", "joints", "events", "steering"]
-
-
 def test_table_has_each_request_with_its_origin(report: Report) -> None:
     rows = [[cell.text for cell in row[1:]] for row in tables(report)["steering"].rows]
     assert rows == [

@@ -314,10 +314,3 @@ def test_the_delay_is_refused_where_none_explains_the_difference() -> None:
     assert fitted(SWING, np.full(2000, 0.3)) is None  # a joint that is blocked
     assert fitted(np.full(2000, 0.5), np.full(2000, 0.5)) is None
     assert DelayFit().best_s(0.01) is None
-
-
-def test_joints_of_a_run_have_a_delay_where_they_moved(torso: Log) -> None:
-    delays = {joint.name: joint.delay_ms for joint in tracking(torso)}
-    assert delays["right_elbow_joint"] is not None
-    assert 0 < delays["right_elbow_joint"] < 100
-    assert not any(value is not None and math.isnan(value) for value in delays.values())

@@ -20,7 +20,7 @@ from dxlrun.log import schemas
 from dxlrun.messages import Header, Length, Number, Time
 from dxlrun.messages.cdr import ENCAPSULATION, Codec
 from dxlrun.messages.declared import WrongMessage, declared_message, package_of
-from dxlrun.messages.definition import MessageType, parse
+from dxlrun.messages.definition import MessageType
 
 if TYPE_CHECKING:
     from fractions import Fraction
@@ -92,14 +92,6 @@ def test_a_known_message_is_the_published_one(kind: type, typestore: Typestore) 
     assert declared.name == kind.ros_type  # type: ignore[attr-defined]  # the list was filtered by it
     assert declared.type_hash == typestore.hash_rihs01(declared.name)
     read_by_rosbags(declared, declared_message(kind, "nothing").pack(kind(), (12, 34)))
-
-
-@pytest.mark.parametrize("message", [*OURS, *STANDARD], ids=lambda message: message.name)
-def test_the_hash_is_that_of_the_text(message: MessageType, typestore: Typestore) -> None:
-    store = get_typestore(Stores.EMPTY)
-    store.register(get_types_from_msg(message.text, message.name))
-    assert store.hash_rihs01(message.name) == message.type_hash
-    assert message in OURS or typestore.hash_rihs01(message.name) == message.type_hash
 
 
 def test_an_own_message_is_read_by_rosbags_field_by_field() -> None:
@@ -331,8 +323,3 @@ def test_a_cut_message_is_refused(cut: int) -> None:
     data = codec.pack(1, 2, 3, 0, "name", "source", "text", "{}")
     with pytest.raises(ValueError, match=r"Event|longer than its message"):
         codec.unpack(data[:cut])
-
-
-def test_a_definition_that_is_not_laid_out_is_refused() -> None:
-    with pytest.raises(ValueError, match="the type a/wide of bounded is not defined"):
-        parse(MessageType("a/msg/B", "wide[<=3] bounded\n"))

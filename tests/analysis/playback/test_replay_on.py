@@ -232,7 +232,9 @@ def test_a_position_limit_is_kept_within_the_tolerance() -> None:
     wave = np.sin(np.linspace(0, 6, 200))
     assert np.abs(rows(1.009 * wave).positions).max() == 1.0
     with pytest.raises(InputError, match=r"pan is at .*, beyond its limits of -57.3 to 57.3 deg"):
-        rows(1.03 * wave)
+        rows(1.03 * np.maximum(wave, 0.0))
+    with pytest.raises(InputError, match=r"pan is at -59.01 deg, beyond its limits of -57.3 to 57.3 deg"):
+        rows(1.03 * np.minimum(wave, 0.0))
     assert np.abs(rows(3 * wave, bounded=False, velocity=20.0).positions).max() == pytest.approx(
         3.0, abs=0.02
     )

@@ -24,7 +24,7 @@ from tests.kit.stories import tell as tell_story
 from dxlrun.channels.commands import CommandMessage
 from dxlrun.channels.event_records import EventCode
 from dxlrun.errors import LogError
-from dxlrun.log.log_reader import Log, read_log
+from dxlrun.log.log_reader import read_log
 from dxlrun.plan.loop_plan import ControllerPlan
 from dxlrun.testing import VirtualRobot
 from dxlrun_analysis.conduct.client_commands import client_commands, policy_begun
@@ -104,20 +104,16 @@ def tell(steer: Callable[..., Path]) -> Callable[[str], Path]:
     return cache(lambda name: steer(STORIES[name], edit=FALLS if name == "a fallback" else KEEPS, name=name))
 
 
-def check_requests(log: Log, commands: Asked) -> None:
-    """Check that a log has the requests of clients, and which of them were refused."""
-    asked = [command for _, commands in sorted(commands.items()) for command in commands]
+@pytest.mark.parametrize("story", STORIES)
+def test_a_steered_run(tell: Callable[[str], Path], story: str) -> None:
+    log = replayed(tell(story))
+    asked = [command for _, commands in sorted(STORIES[story].items()) for command in commands]
     told = [(one.command.controller, one.command.kind, one.command.lease_ns) for one in client_commands(log)]
     assert told == [(one.controller, one.kind, one.lease_ns) for one in asked]
     refused = [event.text for event in log.events if event.code == EventCode.COMMAND_REFUSED]
     assert [one.refusal for one in client_commands(log) if one.refusal] == [
         text.split(" refused: ", 1)[1] for text in refused
     ]
-
-
-@pytest.mark.parametrize("story", STORIES)
-def test_a_steered_run(tell: Callable[[str], Path], story: str) -> None:
-    check_requests(replayed(tell(story)), STORIES[story])
 
 
 def test_the_stories_do_what_they_are_there_for(tell: Callable[[str], Path]) -> None:

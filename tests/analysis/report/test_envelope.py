@@ -76,15 +76,6 @@ def test_bins_of_any_number_of_slices_hold_the_extremes_of_their_samples(
             np.testing.assert_array_equal((rows.low[row, curve], rows.high[row, curve]), expected)
 
 
-def test_bins_of_one_period_hold_one_sample_each() -> None:
-    envelope = Envelope(1, 100, 20)
-    times = np.arange(100, dtype=np.int64) * 20 + 10**12
-    envelope.add_samples(times, np.arange(100, dtype=np.float32)[:, None])
-    rows = envelope.rows()
-    np.testing.assert_array_equal(rows.t_ns, times)
-    np.testing.assert_array_equal(rows.low, rows.high)
-
-
 def test_samples_that_come_late_go_into_the_bin_of_their_time() -> None:
     envelope = Envelope(1, 4, 10)
     envelope.add_samples(np.array([100, 110, 120]), np.array([[1.0], [2.0], [3.0]], np.float32))
