@@ -73,6 +73,10 @@ STORIES: dict[str, Asked] = {
         26: [ask("unload", {"controller": "guest"}), ask("load", LOADED), ask("resume")],
     },
     "a fallback": {5: [rate(100)], 15: [rate(50)]},
+    "registers": {
+        4: [ask("register", {"joint": "nod", "item": "cw_compliance_slope", "value": 64})],
+        9: [ask("register", {"joint": "tilt", "item": "temperature_limit", "value": 60})],
+    },
     "a stop in a pause": {10: [ask("pause")], 20: [ask("stop")]},
     "rubbish": {4: [CommandMessage(0, "", "switch", b'{"activate": ["\xff"]}', "mallory"), ask("policy")]},
 }
