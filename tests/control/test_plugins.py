@@ -33,16 +33,7 @@ def install(tmp_path, monkeypatch):
         yield install
 
 
-STANDARD = {
-    "joint_group_effort_controller",
-    "joint_group_poseffort_controller",
-    "joint_group_position_controller",
-    "joint_group_posvel_controller",
-    "joint_group_pwm_controller",
-    "joint_group_velocity_controller",
-    "joint_state_broadcaster",
-    "joint_trajectory_controller",
-}
+STANDARD = {"joint_state_broadcaster", "joint_trajectory_controller"}
 
 
 def test_the_standard_controllers_enter_by_the_same_door():

@@ -130,13 +130,6 @@ def test_a_refused_idle_latency_names_the_rule_that_allows_it(asked, monkeypatch
     assert 'KERNEL=="cpu_dma_latency", OWNER="' in grant.fix
 
 
-def test_a_c_library_without_mallopt_is_a_refusal(asked, monkeypatch):
-    monkeypatch.setattr(realtime_grants, "libc", object)
-    grant = realtime_grants.apply_scheduler(SchedulerPlan("other", 31, False))[2]
-    assert (grant.request, grant.granted) == ("memory in place", False)
-    assert "mallopt is missing" in grant.sentence
-
-
 def test_the_guardian_asks_for_one_priority_above_the_loop(asked, may):
     may(realtime_grants.IPC_LOCK)
     locked, scheduler = realtime_grants.apply_to_guardian(32, lock=True)
@@ -302,12 +295,6 @@ def test_an_ordinary_process_has_short_slices_where_the_kernel_gives_them(before
     assert found["slice"] == (release >= (6, 12))
     if found["slice"]:
         assert found["flags"] & 1  # children have the usual slices
-
-
-@pytest.mark.skipif(not SLICE, reason="the numbers of the calls are not known on this architecture")
-def test_a_process_without_the_real_time_policy_that_it_asked_for_has_short_slices_too():
-    ordinary = outcome(SLICED.format(before="", policy="other"))["slice"]
-    assert outcome(SLICED.format(before="import resource" + NOBODY, policy="fifo"))["slice"] == ordinary
 
 
 def test_a_real_process_without_rights_gets_plain_sentences():

@@ -270,6 +270,13 @@ def test_a_controller_may_hold_by_commands_of_its_own_when_its_stream_ends(robot
 # Loading
 
 
+def test_an_inactive_controller_of_a_lost_joint_takes_no_command_from_an_active_one(robot):
+    robot.script("right", commanding(position=0.1), joints=("j1",), command=("position",), every=5)
+    robot.script("whole", **OFF)
+    robot.run(10, {7: lambda: robot.manager.hold_lost({0}, "all its joints answer again")})
+    assert robot.column("position", 1) == [0.1] * 10
+
+
 def test_a_controller_that_is_loaded_while_its_servo_is_lost_is_held(left):
     manager = left.build().manager
     manager.hold_lost({0}, "all its joints answer again")

@@ -307,7 +307,6 @@ class Robot:
     def build(
         self,
         end_ns: int | None = None,
-        activity: Any = None,
         overrun_hooks: tuple[OverrunHook, ...] = (),
         **plan: Any,
     ) -> Robot:
@@ -329,7 +328,7 @@ class Robot:
         )
         missing = {"broken_one": "plug-in broken_one of x 1 cannot be imported"}
         plugins = PlugIns(self._offers, missing, after_each=self._after_each)
-        self.manager = Manager(context, plugins, activity=activity)
+        self.manager = Manager(context, plugins)
         self.loop = ControlLoop(context, self.manager, self.sink, overrun_hooks=overrun_hooks)
         self.manager.configure()
         self.hardware.start()

@@ -146,26 +146,11 @@ def test_the_list_for_programs(said: Said, install: Install) -> None:
     code, out, _ = said("plugins", "--json")
     found = {one["name"]: one for one in result_of(out)}
     assert code == 0
-    assert found["first_one_entry"] == {
-        "name": "first_one_entry",
-        "distribution": "first-one 2.5",
-        "contract": 2,
-        "controllers": [
-            {
-                "type": "mine",
-                "commands": [],
-                "goals": [],
-                "topics": [],
-                "references": ["position"],
-                "live": [],
-            }
-        ],
-        "servo_models": [],
-        "overrun": True,
-        "sensors": [],
-        "verbs": [],
-        "broken": "",
-    }
+    first = found["first_one_entry"]
+    assert (first["distribution"], first["contract"], first["broken"]) == ("first-one 2.5", 2, "")
+    (mine,) = first["controllers"]
+    assert (mine["type"], mine["references"], mine["commands"]) == ("mine", ["position"], [])
+    assert first["overrun"]
     assert "No module named 'no_such_thing'" in found["broken_one_entry"]["broken"]
     sensors = {one["type"]: one["simulated"] for one in found["standard_controllers"]["sensors"]}
     assert sensors == {"serial_imu": False, "simulated_imu": True}
