@@ -117,6 +117,14 @@ def test_servos_of_a_joint_that_differ_in_a_register_are_named_with_their_values
     assert joints.answers == [(differ if first != 8 else "", first)]
 
 
+def test_a_register_that_a_servo_does_not_report_differs_from_no_other(joints):
+    joints.hardware.read_register(HIP, "led", lambda *answer: joints.answers.append(answer))
+    for done, answer in zip(joints.servos.done, (("no reply", 0), ("", 8)), strict=True):
+        done(*answer)
+    ((problem, _),) = joints.answers
+    assert problem == "no reply"
+
+
 @pytest.mark.parametrize("servo", range(6))
 def test_row_after_the_joints_is_the_register_of_a_single_servo(joints, servo):
     joints.hardware.read_register(5 + servo, "led", lambda *answer: joints.answers.append(answer))
