@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import json
+import math
 import shlex
-from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from msgspec.structs import replace
+from tests.kit.stories import Clients, ask, prepared
+
 from dxlrun.channels.answers import Completion
-from dxlrun.channels.commands import CommandMessage, QueueInbox
-from dxlrun.control.controllers.plugin_loading import load_plugins
+from dxlrun.channels.commands import CommandMessage
 from dxlrun.log.log_reader import Log, read_log
-from dxlrun.remote.preparation import Preparation
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.testing import simulated_robot
 from dxlrun_analysis.replay import replay_log
@@ -67,37 +67,18 @@ class Ask:
     command: dict[str, object]
 
 
-class Client(QueueInbox):
-    """Asks what it asks when its time has come; commands go through the gateway's checks."""
-
-    def __init__(self, robot: VirtualRobot, asks: Sequence[Ask]) -> None:
-        super().__init__()
-        loop = robot.plan.loop
-        preparation = Preparation({joint.name: joint for joint in loop.joints}, load_plugins())
-        plans = {plan.name: plan for plan in loop.controllers}
-        self._record, self._period_ns = robot.record, loop.period_ns
-        self._asks = deque(
-            (
-                round(ask.at_s * 1e9),
-                CommandMessage(
-                    number,
-                    ask.controller,
-                    ask.kind,
-                    preparation.command(
-                        plans[ask.controller], ask.kind, json.dumps(ask.command).encode()
-                    ).data
-                    if ask.controller
-                    else json.dumps(ask.command).encode(),
-                    "test",
-                ),
-            )
-            for number, ask in enumerate(sorted(asks, key=lambda ask: ask.at_s), 1)
+def clients_of(robot: VirtualRobot, asks: Sequence[Ask]) -> Clients:
+    """Let clients ask when the time has come; commands go through the gateway's checks."""
+    asked: dict[int, list[CommandMessage]] = {}
+    for number, one in enumerate(sorted(asks, key=lambda one: one.at_s), 1):
+        command = (
+            prepared(robot, one.controller, one.kind, **one.command)
+            if one.controller
+            else ask(one.kind, one.command)
         )
-
-    def drain_commands(self) -> Sequence[CommandMessage]:
-        while self._asks and self._asks[0][0] <= self._record.cycle * self._period_ns:
-            self.waiting.append(self._asks.popleft()[1])
-        return super().drain_commands()
+        cycle = math.ceil(round(one.at_s * 1e9) / robot.plan.loop.period_ns)
+        asked.setdefault(cycle, []).append(replace(command, number=number))
+    return Clients(robot, asked)
 
 
 def steered(
@@ -113,8 +94,7 @@ def steered(
     """Run a robot file on virtual time while a client asks, and compare the run with its replay."""
     log = directory / "steered.mcap"
     virtual = simulated_robot(robot, arguments=arguments or {}, duration_s=duration_s, play=play, log=log)
-    client = Client(virtual, asks)
-    virtual.robot.loop.steering.inbox = client
+    client = clients_of(virtual, asks)
     before(virtual)
     result = virtual.run()
     assert (result.reason, result.detail, virtual.failures) == ("ended", "", ())

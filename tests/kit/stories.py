@@ -52,15 +52,17 @@ def torque(joints: Sequence[str], *, on: bool, release: bool = False) -> Command
 
 
 class Clients(QueueInbox):
-    """Ask what they ask in the cycle that the story says."""
+    """Ask what they ask in the cycle that the story says, or in the next one where that is skipped."""
 
     def __init__(self, robot: VirtualRobot, asked: Asked) -> None:
         super().__init__()
-        self.record, self.asked = robot.record, asked
+        self.record, self.asked, self._last = robot.record, asked, -1
         robot.robot.loop.steering.inbox = self
 
     def drain_commands(self) -> Sequence[CommandMessage]:
-        self.waiting.extend(self.asked.get(self.record.cycle, ()))
+        for cycle in range(self._last + 1, self.record.cycle + 1):
+            self.waiting.extend(self.asked.get(cycle, ()))
+        self._last = self.record.cycle
         return super().drain_commands()
 
 

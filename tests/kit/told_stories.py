@@ -36,7 +36,7 @@ import numpy as np
 import pytest
 import yaml
 from tests.kit.cases import Line, TextCase, read_cases
-from tests.kit.clients import Ask, Client
+from tests.kit.clients import Ask, clients_of
 from tests.kit.line_faults import turn_by_hand
 
 from dxlrun.channels.answers import Completion
@@ -107,7 +107,7 @@ class Story:
         file.write_text(self.robot)
         options: dict[str, Any] = {"arguments": self.arguments, "play": self.play, "log": path}
         robot = simulated_robot(file, duration_s=self.seconds, **options)
-        client = robot.robot.loop.steering.inbox = Client(robot, self.asks)
+        client = clients_of(robot, self.asks)
         FaultScript(self.faults).attach(robot.buses)
         for number, by, at_ns in self.hands:
             servo = robot.buses[0].servo(number)

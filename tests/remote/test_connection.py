@@ -2,12 +2,10 @@
 
 import asyncio
 import gc
-import json
 import os
 import random
 import select
 import socket
-import struct
 import subprocess
 import sys
 from contextlib import suppress
@@ -244,25 +242,6 @@ def test_ten_megabytes_are_refused_and_not_read(door, way):
     assert sent < 2 * MOST_BYTES
     assert answer.startswith(b"HTTP/1.1 413 ")
     assert [command.kind for command in door.desk.taken] == ["stop"]
-
-
-def test_a_client_that_dies_after_asking_changes_nothing_for_others(door):
-    body = json.dumps({"positions": [0.5]}).encode()
-    request = GO + b"Content-Length: %d\r\n\r\n" % len(body) + body
-
-    async def act():
-        for _ in range(10):
-            _, writer = await door.connect(request)
-            await asyncio.sleep(0.002)
-            writer.transport.abort()
-        assert await door.stopped()
-
-    door.open(act)
-    kinds = [command.kind for command in door.desk.taken]
-    assert kinds[-1] == "stop"
-    assert set(kinds[:-1]) <= {"go"}
-    assert len(kinds) <= 11
-    assert {command.data for command in door.desk.taken[:-1]} <= {struct.pack("<d", 0.5)}
 
 
 def test_a_client_that_asks_without_reading_is_not_served_for_ever(door):

@@ -1,10 +1,12 @@
 # ruff: noqa: E501 (a request and its answer are read best side by side)
 
-"""The gateway by ASGI: which requests reach the loop, and how they are answered. No time decides."""
+"""The gateway by ASGI: which requests reach the loop, how they are answered, and what a failure costs."""
 
 import asyncio
 import json
+import signal
 import struct
+import time
 from pathlib import Path
 from string import Formatter
 
@@ -12,8 +14,8 @@ import msgspec
 import numpy as np
 import pytest
 from msgspec.structs import replace
-from pydantic import create_model
 from tests.kit.pages import page_text
+from tests.remote.conftest import Arm, Desk
 
 from dxlrun.channels.answers import Acceptance, Code, CommandOutcome, Completion, Refusal
 from dxlrun.channels.commands import MOST_PER_CYCLE
@@ -21,9 +23,10 @@ from dxlrun.channels.cycle import CycleLayout, CycleRecord
 from dxlrun.channels.event_records import EventBody, EventCode, Severity
 from dxlrun.channels.heartbeat import Phase
 from dxlrun.compile.joints.limits import LimitViolation
+from dxlrun.control.controllers.plugin_loading import Offer, PlugIns
 from dxlrun.plan.loop_plan import ControllerPlan
-from dxlrun.remote import asked, link, server
-from dxlrun.remote.preparation import PreparedCommand, RefusedRequest, _of_motions, in_si
+from dxlrun.remote import asked, link, preparation, server
+from dxlrun.remote.preparation import PreparedCommand, RefusedRequest, in_si
 from dxlrun.remote.requests import request_table as requests
 from dxlrun.remote.requests.request_table import MOST_OPERATIONS, MOST_SET_POINTS, Role
 from dxlrun.remote.sockets import MOST_BYTES
@@ -124,24 +127,6 @@ def test_what_is_no_quantity_stays_as_it_was_written():
     assert plain(**command) == command
 
 
-@pytest.mark.parametrize(
-    ("kind", "keys", "of_motions"),
-    [
-        ("positions", ("positions",), True),
-        ("posvel", ("positions", "velocities"), True),
-        ("trajectory", ("points", "start_in"), True),
-        ("grip", ("positions", "force"), False),
-        ("speeds", ("velocities",), True),
-        ("poseffort", ("positions", "efforts"), True),
-        ("pwm", ("pwm",), True),
-        ("reset", (), False),
-    ],
-)
-def test_only_the_commands_of_the_standard_controllers_have_units(kind, keys, of_motions):
-    model = create_model("Model", **dict.fromkeys(keys, (object, ...)))
-    assert _of_motions(kind, model) is of_motions
-
-
 def test_parameters_of_a_controller_are_parsed_once_and_anew_when_another_is_loaded(desk, monkeypatch):
     parsed = []
     model = desk.gateway._preparation.plugins.controllers["arm"].controller.Parameters
@@ -225,6 +210,8 @@ def test_a_flood_of_set_points_gives_the_loop_one_a_cycle_and_takes_nothing_from
     assert desk.take() == []
     desk.now += 0.01
     assert asyncio.run(flood(100, ("process 1", Role.ADMIN))).count(202) == MOST_SET_POINTS * 0.01
+    desk.now += 60.0  # what was not used is not kept
+    assert asyncio.run(flood(1000, ("process 1", Role.ADMIN))).count(202) == MOST_SET_POINTS / 10
 
 
 def test_a_flood_from_ever_new_processes_is_remembered_for_some_of_them_only(desk):
@@ -597,3 +584,72 @@ def test_a_switch_that_names_one_thousands_of_times_does_not_reach_the_loop(desk
     status, answer = desk.ask("POST", "/switch", {key: ["left"] * 20_000})
     assert (status, answer["code"], answer["fields"]) == (422, "named_twice", {"controller": ["left"]})
     assert desk.taken == []
+
+
+# Load, and failures of a part
+
+
+@pytest.mark.parametrize(("text", "count"), [("x", 3000), ("x" * 7000, 300)])
+def test_a_storm_of_events_is_kept_in_bounded_memory(desk, text, count):
+    for number in range(count):
+        desk.events.emit_event("pan", EventBody(EventCode.GATE, Severity.WARNING, f"{number} {text}"))
+        desk.link.collect_messages()
+    kept = [event.text for _, event in desk.link.events]
+    assert len(kept) <= link.KEPT_EVENTS
+    assert sum(map(len, kept)) <= link.KEPT_TEXT
+    assert len(kept) == link.KEPT_EVENTS or sum(map(len, kept)) > link.KEPT_TEXT - 8000
+    assert kept[-1].startswith(f"{count - 1} ")
+    assert all(one.endswith(text) for one in kept)
+
+
+def test_a_controller_whose_stream_ended_is_held_until_its_next_command(desk):
+    def held():
+        desk.link.collect_messages()
+        return desk.ask("GET", "/robot")[1]["controllers"][0]["held"]
+
+    for code, expected in (
+        (EventCode.STALE_COMMAND, True),
+        (EventCode.CONTROLLER_SAYS, True),
+        (EventCode.COMMAND, False),
+        (EventCode.STALE_COMMAND, True),
+        (EventCode.CONTROLLER_DEACTIVATED, False),
+    ):
+        desk.events.emit_event("left", EventBody(code, Severity.INFO, ""))
+        assert held() is expected
+
+
+def test_a_plug_in_that_never_returns_is_interrupted_and_the_next_client_is_served(desk, monkeypatch):
+    monkeypatch.setattr(preparation, "BUDGET_S", 0.05)
+    status, content = desk.ask("POST", "/controllers/left/commands/brood", {"count": 1})
+    assert (status, content["refused"]) == (
+        422,
+        "left needed more than 0.05 s to prepare the command; send less at once",
+    )
+    assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
+    assert desk.ask("POST", "/stop") == (200, DONE)
+    assert [command.kind for command in desk.taken] == ["stop"]
+
+
+class SlowOffers(dict):
+    """Offers of a package that takes long to import."""
+
+    def get(self, name, default=None):
+        """Return an offer after the import."""
+        time.sleep(0.1)
+        return super().get(name, default)
+
+
+def test_import_of_a_controller_that_is_loaded_is_not_interrupted(monkeypatch):
+    monkeypatch.setattr(preparation, "BUDGET_S", 0.05)
+    desk = Desk(plugins=PlugIns(SlowOffers(arm=Offer("arm", Arm, "tests 1")), {}))
+    status, content = desk.ask("POST", "/controllers", {"name": "more", "type": "arm", "joints": ["pan"]})
+    assert status == 200, content
+
+
+def test_a_failure_of_the_gateway_itself_fails_one_request_only(desk, monkeypatch, capsys):
+    monkeypatch.setattr(desk.link, "newest", lambda: 1 / 0)
+    status, content = desk.ask("GET", "/states")
+    assert status == 500
+    assert "ZeroDivisionError" in content["refused"]
+    assert "Traceback" in capsys.readouterr().err
+    assert desk.ask("POST", "/pause") == (200, DONE)

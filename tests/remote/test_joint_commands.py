@@ -1,21 +1,26 @@
-"""Joints by name: goals that are made of their commands, and registers of servos that limit them.
+"""Joints by name: goals made of their commands, registers that limit them, and what servos answer.
 
 Commands that need nothing else are in `requests/joints.txt`, whose robot is used here.
 """
 
+import asyncio
 import json
 
 import msgspec
 import numpy as np
 import pytest
+from msgspec.structs import replace
 from tests.remote.conftest import plugins
 
+from dxlrun.channels.answers import Acceptance, Code, Completion, Refusal
+from dxlrun.channels.cycle import Torque
 from dxlrun.channels.event_records import EventBody, EventCode, Severity
 from dxlrun.plan.loop_plan import ServoLimit
 
 CURRENT = ServoLimit("effort", 0.0538, "Current Limit (38) = 20, 0.0538 A")
 PWM = ServoLimit("pwm", 0.2, "PWM Limit (36) = 177, 20 %")
 STILL = ServoLimit("velocity", 0.0, "Velocity Limit (44) = 0, 0 rad/s")
+GAIN = "/joints/pan/registers/position_p_gain"
 
 
 @pytest.fixture
@@ -62,6 +67,16 @@ def test_positions_of_a_group_controller_become_a_goal_when_they_are_waited_for(
     assert part["end_ns"] * 1e-9 == pytest.approx(seconds)
 
 
+def test_a_goal_has_the_time_in_which_its_joint_comes_to_its_speed(head):
+    joints = head.gateway._preparation.joints
+    joints["pan"] = replace(joints["pan"], acceleration=1.0)
+    _, _, command = send(head, "posvel", "position", {"pan": "0.5 rad"}, "&goal=true")
+    (part,) = json.loads(command.data.partition(b"\n")[0])["parts"]
+    assert part["end_ns"] * 1e-9 == pytest.approx(
+        0.5 + 0.5
+    )  # 0.25 rad at 0.5 rad/s, to which it comes in 0.5 s
+
+
 def test_a_trajectory_is_what_it_is_when_it_is_waited_for(head):
     for query in ("&goal=true", "&in=3"):
         _, answer, command = send(head, "trajectory", "position", {"pan": "0.5 rad"}, query)
@@ -98,3 +113,66 @@ def test_a_command_beyond_a_register_is_refused_once_the_loop_has_reported_it(
     status, answer, _ = send(head, controller, interface, {"pan": 0.3})
     assert (status, answer["code"], said in answer["refused"]) == (422, "beyond_limits", True), answer
     assert send(head, controller, interface, {"pan": within})[0] == 200
+
+
+def test_a_servos_failure_is_the_answer(head):
+    said = "pan (ID 1 on bus main) did not answer"
+    refusal = Refusal(Code.REGISTER_NOT_WRITTEN, {"problem": said})
+    status, content = head.ask("POST", GAIN, {"value": 1}, refusal=refusal)
+    assert (status, content["refused"], content["code"]) == (409, said, "register_not_written")
+
+
+def test_an_item_is_read_with_its_meaning(head):
+    status, content = head.ask(
+        "GET", "/joints/pan/registers/return_delay_time", refusal=Completion(7, value=250)
+    )
+    assert status == 200
+    assert content == {
+        "done": True,
+        "cycle": 7,
+        "joint": "pan",
+        "item": "return_delay_time",
+        "title": "Return Delay Time (9)",
+        "area": "EEPROM",
+        "value": 250,
+        "is": "500 us",
+    }
+    (taken,) = head.taken
+    assert (taken.kind, json.loads(taken.data)) == ("get", {"joint": "pan", "item": "return_delay_time"})
+
+
+def test_the_old_value_is_answered(head):
+    status, content = head.ask("POST", GAIN, {"value": 900}, refusal=Completion(7, value=800))
+    assert (status, content) == (200, {"done": True, "cycle": 7, "old": 800, "value": 900})
+
+
+def test_a_joints_state_is_answered(head):
+    head.record.states.position[:] = 0.25
+    head.record.states.torque[:] = Torque.RELEASED
+    head.finish_cycle()
+    status, content = head.ask("GET", "/joints/tilt")
+    assert status == 200
+    assert (content["joint"], content["position"], content["torque"]) == ("tilt", 0.25, "limp")
+    assert (content["effort_unit"], content["velocity"]) == ("A", None)
+
+
+def test_waiting_answers_keep_the_client_waiting(head):
+    """A joint after the other is done; the last answer counts."""
+    answers = [Acceptance(()), Acceptance(()), Completion(9)]
+
+    async def story():
+        asked = asyncio.ensure_future(head.request("POST", "/torque", {"joints": ["all"], "on": False}))
+        commands = []
+        while not commands:
+            commands = list(head.mailbox.drain_commands())
+            await asyncio.sleep(0)
+        for answer in answers:
+            assert not asked.done()
+            head.mailbox.answer_command(commands[0].number, answer)
+            head.link.collect_messages()
+            await asyncio.sleep(0.001)
+        for _ in range(12):
+            head.finish_cycle()
+        return await asked
+
+    assert asyncio.run(story()) == (200, {"done": True, "cycle": 9, "joints": ["pan", "tilt"]})

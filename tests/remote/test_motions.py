@@ -108,14 +108,6 @@ def test_a_motion_begins_softly_when_the_slowest_joint_is_there(head):
     assert head.taken[-1].origin.endswith(": wave.yaml")
 
 
-def test_joints_that_are_there_already_begin_at_once(head):
-    head.record.states.position[:] = [0.7, 0.1]
-    head.finish_cycle()
-    _, _, (positions, posvel) = play(head, NOD)
-    assert positions[2].tolist() == [0.0, 1.0]
-    assert posvel[2].tolist() == [0.0, 1.0, 2.0]
-
-
 @pytest.mark.parametrize("speed", [0.5, 2.0])
 def test_the_speed_scales_times_and_velocities(head, speed):
     _, answer, (positions, posvel) = play(head, NOD, speed)
@@ -132,15 +124,20 @@ def test_a_trajectory_is_one_goal_with_its_parts_in_a_row(head):
 motions:
   - controller: arm
     start: 2 s
-    points: [{time: 500 ms, joints: {tilt: {position: 0.4 rad}}}]
+    points: [{time: 500 ms, joints: {tilt: {position: 0.4 rad, velocity: 0 rad/s, acceleration: 0 rad/s^2}}}]
   - controller: arm
-    points: [{time: 0 s, joints: {tilt: {position: 0.3 rad}}}, {time: 1 s, joints: {tilt: {position: 0.2 rad}}}]
+    points:
+      - {time: 0 s, joints: {tilt: {position: 0.3 rad, velocity: 0 rad/s, acceleration: 0 rad/s^2}}}
+      - {time: 1 s, joints: {tilt: {position: 0.2 rad, velocity: 0.1 rad/s, acceleration: 0.4 rad/s^2}}}
 """
     status, answer, (arm,) = play(head, text, 0.5)
     assert status == 200, answer
     assert arm[:2] == ("arm", "trajectory")
     assert arm[2].tolist() == [0.0]
-    points = [{"time": time, "positions": [at]} for time, at in ((0.0, 0.3), (2.0, 0.2), (5.0, 0.4))]
+    points = [  # half as fast: half of the velocity, and a quarter of the acceleration
+        {"time": time, "positions": [at], "velocities": [speed], "accelerations": [rise]}
+        for time, at, speed, rise in ((0.0, 0.3, 0.0, 0.0), (2.0, 0.2, 0.05, 0.1), (5.0, 0.4, 0.0, 0.0))
+    ]
     command = JointTrajectoryController.Commands["trajectory"](points=points, start_in=0.2)
     parameters = JointTrajectoryController.Parameters(joints=("tilt",))
     np.testing.assert_allclose(

@@ -19,7 +19,7 @@ from dxlrun.remote.asked import LONGEST_ORIGIN
 from dxlrun.remote.client import RemoteRobot, connect
 from dxlrun.remote.network.certificates import client_context, counts, keys_place, server_context
 from dxlrun.remote.network.commander import LEASE_S
-from dxlrun.remote.network.listener import MOST_UNPROVED, Listener
+from dxlrun.remote.network.listener import MOST_UNPROVED, ListenAddress, Listener
 from dxlrun.remote.network.network_link import NetworkLink, known_robots
 from dxlrun.remote.requests.request_table import REQUESTS, Role
 from dxlrun.remote.sockets import Address
@@ -242,16 +242,19 @@ def test_one_client_commands_and_another_one_may_stop_or_take_over(desk):
     assert json.loads(desk.taken[5].data) == {"client": "anna", "instead": "bert"}
 
 
-@pytest.mark.parametrize("chosen", [b"bert", b"process 7", b"b" * 200, b"client bert: bert"])
-def test_a_name_that_a_client_chose_does_not_hide_that_of_its_certificate(desk, chosen):
+@pytest.mark.parametrize(
+    ("chosen", "origin"),
+    [
+        *(
+            (text, f"client anna: {text.decode()}")
+            for text in (b"bert", b"process 7", b"b" * 200, b"client bert: b")
+        ),
+        *((text, "client anna") for text in (b"", b"   ", b"\x00\x1b")),
+    ],
+)
+def test_a_name_that_a_client_chose_does_not_hide_that_of_its_certificate(desk, chosen, origin):
     desk.ask("POST", "/stop", client=("client anna", Role.COMMAND), headers=[("x-dxlrun-client", chosen)])
-    assert desk.taken[-1].origin == f"client anna: {chosen.decode()}"[:LONGEST_ORIGIN]
-
-
-@pytest.mark.parametrize("chosen", [b"", b"   ", b"\x00\x1b"])
-def test_client_without_a_name_of_its_own_has_that_of_its_certificate(desk, chosen):
-    desk.ask("POST", "/stop", client=("client anna", Role.COMMAND), headers=[("x-dxlrun-client", chosen)])
-    assert desk.taken[-1].origin == "client anna"
+    assert desk.taken[-1].origin == origin[:LONGEST_ORIGIN]
 
 
 @campaign(ci=150, night=300, release=1000)
@@ -327,3 +330,31 @@ def test_a_certificate_that_cannot_be_written_does_not_count_as_issued(tmp_path,
     assert [*authority.issued()] == []
     authority.issue("anna", Role.COMMAND, 30, tmp_path / "anna")
     assert [one.name for one in authority.issued()] == ["anna"]
+
+
+# The value of --listen of `view` and `foxglove`
+
+
+@pytest.mark.parametrize(
+    ("text", "place"),
+    [
+        ("127.0.0.1", ListenAddress("127.0.0.1", None)),
+        (":9000", ListenAddress("127.0.0.1", 9000)),
+        (":0", ListenAddress("127.0.0.1", 0)),
+        ("lab3:9000", ListenAddress("lab3", 9000)),
+        ("0.0.0.0:65535", ListenAddress("0.0.0.0", 65535)),  # noqa: S104
+        ("::1", ListenAddress("::1", None)),
+        ("::", ListenAddress("::", None)),
+        ("fe80::1:9000", ListenAddress("fe80::1:9000", None)),
+        ("[::1]", ListenAddress("::1", None)),
+        ("[::1]:9000", ListenAddress("::1", 9000)),
+    ],
+)
+def test_place_is_read_from_its_text(text, place):
+    assert ListenAddress.parse(text) == place
+
+
+@pytest.mark.parametrize("text", ["", ":", ":65536", ":99999999", "lab3:", "lab3:http", "x:y:z", "[::1]9000"])
+def test_text_that_is_no_place_is_refused(text):
+    with pytest.raises(InputError, match="write HOST:PORT, HOST or :PORT"):
+        ListenAddress.parse(text)

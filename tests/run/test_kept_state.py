@@ -55,13 +55,19 @@ arguments:
   port: {default: sim, help: "serial port"}
   id: {default: 3, help: "ID of pan"}
   gain: {default: 32, help: "P gain of pan"}
+  direction: {default: 1, help: "direction of pan"}
 buses:
   main:
     {port: "${port}", protocol: 1.0, baud_rate: 1_000_000, return_delay_time: 0 us, adapter: {latency: 1 ms}}
 loop: {rate: 100, tolerated_skips: 100 %}
 joints:
   pan:
-    {bus: main, id: "${id}", model: MX-28, reference: 180 deg, direction: 1, registers: {p_gain: "${gain}"}}
+    bus: main
+    id: "${id}"
+    model: MX-28
+    reference: 180 deg
+    direction: "${direction}"
+    registers: {p_gain: "${gain}"}
 controllers:
   runs: {type: runs, joints: [pan], size: 20000}
 """
@@ -171,6 +177,7 @@ def test_a_replay_compares_what_left_also_of_a_run_that_keeps_nothing(robot, tmp
     [
         ({"id": "4"}, "pan ID was 3 on bus main, now 4 on bus main"),
         ({"gain": "20"}, "pan p_gain was 32, now 20"),
+        ({"direction": "-1"}, "pan direction was 1, now -1"),
     ],
 )
 def test_another_servo_begins_anew_and_says_why(robot, tmp_path, change, why):
@@ -185,6 +192,7 @@ def test_simulated_and_real_servos_do_not_share_a_state(robot, tmp_path):
     simulated, real = plan_of(robot), plan_of(robot, arguments={"port": "/dev/ttyUSB0"})
     home = Path(os.environ["XDG_STATE_HOME"]) / "dxlrun/keeper"
     assert (state_directory(simulated), state_directory(real)) == (home / "simulated", home)
+    assert state_directory(replace(real, buses=(*real.buses, *simulated.buses))) == home / "simulated"
     # the servos of `dxlrun sim` are on a pseudo-terminal, or behind a link to one
     terminals = os.openpty()
     link = tmp_path / "servos"

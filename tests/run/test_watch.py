@@ -18,7 +18,7 @@ from rich.console import Console
 from tests.kit.live_run import ROBOT
 
 from dxlrun.channels import child_processes, heartbeat
-from dxlrun.channels.child_processes import Cut, LineLost, Stop
+from dxlrun.channels.child_processes import Cut, LineLost, LineReturned, MessageChannel, Stop
 from dxlrun.channels.cycle import Commands, States
 from dxlrun.channels.event_records import Event, EventBody, EventCode, EventRing, Severity, SimulationStall
 from dxlrun.channels.heartbeat import ControllerMethod, Heartbeat, Phase, ProcessorTime, Standstill
@@ -30,7 +30,7 @@ from dxlrun.plan.robot_plan import Plan
 from dxlrun.process_table import read_stat
 from dxlrun.run import process_watch, supervisor
 from dxlrun.run.guardian import LONGEST_LOOK_NS, Ended, Guardian, GuardianMessage
-from dxlrun.run.loop_process import Pulse, StallReport, StopRequest
+from dxlrun.run.loop_process import LineReopener, Pulse, StallReport, StopRequest
 from dxlrun.run.process_watch import (
     HALTED_NS,
     LEAST_TIMEOUT_NS,
@@ -72,12 +72,6 @@ def page():
     made = Heartbeat(descriptor)
     os.close(descriptor)
     return made
-
-
-def test_standing_still_counts_while_the_watcher_is_awake():
-    still = Standstill(LONGEST_LOOK_NS, 0)
-    assert [still.ns("same", at * MS) for at in (0, 10, 20, 30)] == [0, 10 * MS, 20 * MS, 30 * MS]
-    assert still.ns("other", 40 * MS) == 0
 
 
 def test_a_machine_that_slept_is_no_hung_loop():
@@ -360,6 +354,7 @@ def watcher(plan):
         (Phase.DONE, -9, "hung", "done"),  # torque was off before it hung at its exit
         (Phase.DONE, -9, "cut", "cut"),
         (Phase.LOADING, -9, "hung", "unused"),
+        (Phase.LOADING, -9, "late", "unused"),
         (Phase.LOADING, 2, None, "unused"),
         (Phase.LOADING, -15, None, "unused"),
         (Phase.SETUP, 1, None, "died"),  # some servos may have torque
@@ -566,6 +561,12 @@ def test_a_loop_ends_by_itself_only_when_neither_of_the_others_responds(page, be
     assert ended == [beating == "neither" and at_ms * MS > HALTED_NS for at_ms in range(0, 500, 20)]
 
 
+def test_a_slow_loop_ends_when_neither_has_responded_for_a_period(page):
+    with Stopped() as supervisor, Stopped() as guardian:
+        loop_watch = LoopWatch(page, supervisor, guardian, 2000 * MS, 0)
+        assert [loop_watch.duty(at_ms * MS) for at_ms in (2000, 4000)] == [Duty.NONE, Duty.END]
+
+
 def test_a_loop_on_a_starved_machine_goes_on(page):
     """Both others only wait for a processor: this process stands for them."""
     loop_watch = LoopWatch(page, os.getpid(), os.getpid(), 20 * MS, 0)
@@ -675,3 +676,21 @@ def test_waits_for_simulated_servos_are_reported_once_a_second() -> None:
     }
     assert sum(one.times for one in waited) == 3000
     assert sum(one.waited_ns for one in waited) == 3000 * MS == report.total.waited_ns
+
+
+def test_lost_line_is_requested_once_per_loss(tmp_path):
+    ours, theirs = socket.socketpair()
+    guardian = MessageChannel(theirs, Decoder(LineLost))
+    reopen = LineReopener(MessageChannel(ours, Decoder(LineReturned)))
+    with open(tmp_path / "line", "w+b") as line:
+        for _ in range(2):
+            assert reopen(0) is None
+            assert reopen(0) is None
+            assert guardian.receive_messages() == [LineLost(0)]
+            guardian.send_message(LineReturned(0), [line.fileno()])
+            descriptor = reopen(0)
+            assert os.fstat(descriptor).st_ino == os.fstat(line.fileno()).st_ino
+            os.close(descriptor)
+    guardian.close()
+    assert reopen(0) is None
+    ours.close()

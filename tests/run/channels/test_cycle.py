@@ -74,16 +74,6 @@ def test_no_two_fields_share_a_byte_and_lengths_are_set(joints, controllers, ref
         assert len(record[name]) == record[f"{name}_length"]
 
 
-def test_the_raw_bytes_are_a_view_and_the_size_of_a_slot():
-    layout = layout_of(8, 2)
-    record = CycleRecord(layout)
-    before = bytes(record.raw)
-    record.cycle = 3
-    assert len(record.raw) == layout.size
-    assert record.raw.format == "B"
-    assert bytes(record.raw) != before
-
-
 def test_before_the_first_reply_nothing_is_known():
     states = CycleRecord(layout_of(2, 1)).states
     assert np.isnan(states.position).all()

@@ -20,7 +20,7 @@ from dxlrun.channels.logged_packets import (
     split_packets,
 )
 from dxlrun.channels.ring import Handover, Payload, RecordKind, RingReader, RingWriter, create, record_size
-from dxlwire.packets import PacketKind, PacketLog
+from dxlwire.packets import PacketKind
 
 TIMES = st.integers(-(2**63), 2**63 - 1)
 PACKETS = st.builds(
@@ -79,13 +79,6 @@ def test_noise_longer_than_the_desk_is_cut_and_nothing_of_it_lost(noise):
     assert {(piece.kind, piece.first_ns, piece.last_ns) for piece in pieces} == {(PacketKind.NOISE, 5, 9)}
 
 
-def test_a_commit_without_packets_takes_no_slot():
-    slots, writer = collected()
-    batch = PacketBatch(writer)
-    batch.commit_packets()
-    assert slots == []
-
-
 @pytest.mark.parametrize("cut", [17, 26, 39, 41])
 def test_a_cut_batch_is_refused(cut):
     slots, writer = collected()
@@ -113,13 +106,6 @@ def test_the_ring_holds_ten_seconds_of_a_robot(rate, servos):
     (cycle,) = slots  # nothing is committed in the middle
     assert len(cycle) <= LONGEST_BATCH
     assert record_size(len(cycle)) * rate * 10 <= packet_capacity(1_000_000_000 // rate, servos)
-
-
-def test_without_a_log_packets_are_taken_and_forgotten():
-    sink = PacketLog()
-    sink.wake(0)
-    sink.packet(0, PacketKind.NOISE, 1, 2, 3, b"abc")
-    sink.commit_packets()
 
 
 def test_what_a_dead_process_left_on_its_desk_is_taken_up_once():

@@ -89,32 +89,6 @@ def test_every_record_is_delivered_as_it_was_or_declared_lost(capacity, steps):
         os.close(descriptor)
 
 
-@pytest.mark.parametrize("length", range(41))
-def test_a_record_goes_round_at_every_offset(make, length):
-    """With a record of one word less than the capacity, starts move by a word at each round."""
-    descriptor = make(104, 48)
-    writer, reader = RingWriter(descriptor), RingReader(descriptor)
-    starts = set()
-    for number in range(60):
-        payload = bytes([number]) * length
-        starts.add(writer.head % 104)
-        append(writer, payload, b"next")
-        assert all_of(reader) == [event(payload), event(b"next")]
-    assert len(starts) > 1 or 104 % (record_size(length) + 32) == 0
-    if length == 16:
-        assert starts == set(range(0, 104, 8))
-
-
-def test_the_longest_record_of_a_ring_that_holds_one_is_read_again_and_again(make):
-    descriptor = make(record_size(100), 100)
-    writer, reader = RingWriter(descriptor), RingReader(descriptor)
-    for number in range(20):
-        append(writer, bytes([number]) * 100)
-        assert all_of(reader) == [event(bytes([number]) * 100)]
-    append(writer, b"a" * 100, b"b" * 100)
-    assert all_of(reader) == [Gap(1), event(b"b" * 100)]
-
-
 @pytest.mark.parametrize("number", [0, 1, 2])
 def test_gap_has_a_record_at_least_where_the_count_of_records_is_damaged(make, number):
     descriptor = make(512, 64)
@@ -213,14 +187,6 @@ def test_a_record_that_is_being_written_is_not_delivered_and_what_it_overwrites_
     assert all_of(reader) == [Gap(1), event(b"second.."), event(b"third...")]
     append(RingWriter(descriptor), b"fourth..")
     assert all_of(reader) == [event(b"fourth..")]
-
-
-def test_a_second_writer_goes_on_where_the_first_ended(make):
-    descriptor = make(256, 16)
-    reader = RingReader(descriptor)
-    append(RingWriter(descriptor), b"a", b"b")
-    append(RingWriter(descriptor), b"c")
-    assert all_of(reader) == [event(b"a"), event(b"b"), event(b"c")]
 
 
 def test_numbers_go_round_without_a_gap(make):
