@@ -13,8 +13,10 @@ import time
 from contextlib import closing
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import msgspec
+import numpy as np
 import pytest
 from rich.console import Console
 from tests.kit.awaited import until
@@ -85,6 +87,27 @@ def test_the_last_error_stays_and_warnings_are_none(lab: Path) -> None:
             )
         view._replied = time.monotonic() - 1.01 * SILENT_S
         assert (view.seen().state, view.seen().reason) == ("unreachable", "no answer")
+
+
+def test_a_row_has_the_lowest_voltage_and_the_hottest_joint() -> None:
+    class Runs:
+        def info(self) -> object:
+            return msgspec.to_builtins(INFO) | {"paused": True}
+
+        def events(self, after: int) -> object:
+            return msgspec.to_builtins(Events((), 0))
+
+        def states(self) -> object:
+            temperature, voltage = np.array([30.0, 41.0, np.nan]), np.array([11.5, 12.0, np.nan])
+            return SimpleNamespace(joints=("hip", "knee", "toe"), temperature=temperature, voltage=voltage)
+
+    with closing(RobotView("joint", ADDRESS)) as view:
+        view.tried.wait()
+        view.close()
+        view._replied = time.monotonic() + 3600.0
+        view._poll_robot(Runs(), 0)
+        seen = view.seen()
+    assert (seen.state, seen.voltage, seen.temperature, seen.hottest) == ("paused", 11.5, 41.0, "knee")
 
 
 def test_what_an_agent_answers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

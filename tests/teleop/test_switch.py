@@ -35,11 +35,15 @@ NEXT = InputState((1.0,), True, frozenset({Press.NEXT}))
 
 
 def driven(
-    directory: Path, *script: tuple[float, InputState], targets: tuple[str, ...] = (), factor: float = 1.0
+    directory: Path,
+    *script: tuple[float, InputState],
+    targets: tuple[str, ...] = (),
+    factor: float = 1.0,
+    text: str = ROBOT,
 ) -> DrivenRobot:
     """Run; of the script each counts from its time, s, on."""
     path = directory / "arm.yaml"
-    path.write_text(ROBOT)
+    path.write_text(text)
     run, once = DrivenRobot(path, script[-1][0] + 0.5, {}), [at for at, given in script if given.presses]
 
     def begin(client: RemoteRobot) -> Callable[[float], object]:
@@ -88,6 +92,12 @@ def test_a_joint_stops_at_its_limit(tmp_path: Path) -> None:
     found = moves(driven(tmp_path, (0.5, HELD), (2.0, FREE), targets=("wrist",), factor=4.0))
     assert {*found} == {2}
     assert found[2][-1][1] == pytest.approx(2048 + 30 * TICKS, abs=1)
+
+
+def test_a_joint_that_is_as_fast_as_it_may_be_stops_when_it_is_released(tmp_path: Path) -> None:
+    slow = ROBOT.replace("limits: {", "limits: {velocity: 0.4 rad/s, ")
+    found = moves(driven(tmp_path, (0.5, HELD), (1.0, FREE), (1.6, FREE), factor=4.0, text=slow))
+    assert 0.9 < max(at for at, _ in found[1]) < 1.25
 
 
 def test_targets_choose_joints_in_their_order_and_what_no_controller_takes_is_refused(
