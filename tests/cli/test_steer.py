@@ -18,6 +18,7 @@ from tests.kit import commands
 from tests.kit.answers import read_answer, result_of
 from tests.kit.awaited import DEADLINE_S, until
 from tests.kit.commands import Case, cases, play
+from tests.kit.live_run import LiveRuns, Running
 from tests.kit.pages import page_text
 
 from dxlrun import DxlrunError, GoalState, GoalTimeout, RemoteRobot, connect, running
@@ -30,62 +31,31 @@ TORSO = ROOT / "robots" / "bioloid_torso.yaml"
 CODE = "import sys; from dxlrun.cli import main; sys.exit(main())"
 
 
-class Stage:
-    """Keeps a torso running; what it wrote stands in `said`."""
-
-    def __init__(self, directory: Path) -> None:
-        self.directory = directory
-        self.process: subprocess.Popen[bytes] | None = None
-
-    @property
-    def said(self) -> str:
-        return (self.directory / "said").read_text()
-
-    def start(self) -> None:
-        """Start a torso, unless it runs."""
-        if self.process is not None and self.process.poll() is None:
-            if running():
-                return
-            self.ended()
-        with (self.directory / "said").open("wb") as said:
-            self.process = subprocess.Popen(
-                [sys.executable, "-P", "-c", CODE, str(TORSO), "--duration", "300", "--no-record"],
-                cwd=self.directory,
-                stdout=said,
-                stderr=said,
-            )
-        process = self.process
-
-        def lives() -> None:
-            assert process.poll() is None, self.said
-
-        until(running, lambda: self.said, check=lives)
-
-    def ended(self) -> int:
-        """Return the exit code of the torso that ran."""
-        assert self.process is not None
-        return self.process.wait(DEADLINE_S)
-
-
 @pytest.fixture(scope="module")
-def stage(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stage]:
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveRuns]:
     directory = tmp_path_factory.mktemp("run")
-    stage = Stage(directory)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_RUNTIME_DIR", str(directory))
-        yield stage
-        if stage.process is not None and stage.process.poll() is None:
-            stage.process.terminate()
-            stage.ended()
+        runs = LiveRuns(directory)
+        yield runs
+        runs.end()
 
 
 @pytest.fixture
-def torso(stage: Stage) -> Iterator[RemoteRobot]:
+def run(runs: LiveRuns) -> Running:
+    """The torso that runs; a new one after one that has ended."""
+    if not running():
+        runs.shared = runs.start("--duration", "300", "--no-record", robot=TORSO, gateway=True)
+        until(running, check=runs.shared.lives)
+    return runs.shared
+
+
+@pytest.fixture
+def torso(run: Running) -> Iterator[RemoteRobot]:
     """The torso as it is after its start."""
-    stage.start()
     with connect(client="the test") as robot:
         yield robot
-    if running() and stage.process is not None and stage.process.poll() is None:
+    if running() and run.process.poll() is None:
         with connect(client="the test") as robot:
             settle(robot)
 
@@ -161,15 +131,6 @@ def test_send_moves_the_joints_that_are_named_with_units(dxlrun, torso: RemoteRo
     until_sent(torso, "head_pitch_joint", 0.3491)
 
 
-def test_a_goal_is_waited_for_and_reached(dxlrun, torso: RemoteRobot) -> None:
-    words = ("send", "left_arm", "position", "left_elbow_joint=20deg", "--in", "200ms")
-    said = dxlrun(*words, "--wait", "--json")
-    result = result_of(said.out)
-    assert (said.code, result["status"], result["progress"]) == (0, "reached", 1.0)
-    assert torso.goal_state(result["goal"]).reached
-    assert torso.states().joint("left_elbow_joint")["goal_position"] == pytest.approx(0.349, abs=0.003)
-
-
 def test_python_follows_and_cancels_a_goal(torso: RemoteRobot) -> None:
     goal = torso.send("left_arm", "position", {"left_elbow_joint": -0.3}, seconds=20.0).goal
     assert goal is not None
@@ -187,7 +148,7 @@ def test_python_follows_and_cancels_a_goal(torso: RemoteRobot) -> None:
     assert torso.goals()[-1].number == goal.number
 
 
-def test_ctrl_c_at_a_terminal_that_waits_cancels_the_goal(torso: RemoteRobot, stage: Stage) -> None:
+def test_ctrl_c_at_a_terminal_that_waits_cancels_the_goal(torso: RemoteRobot) -> None:
     words = ("send", "left_arm", "position", "left_elbow_joint=-20deg", "--in", "60s", "--wait")
     before = len(torso.goals())
     waiting = subprocess.Popen(
@@ -247,18 +208,10 @@ def test_a_refusal_has_its_code_and_its_fields_for_programs(dxlrun, torso: Remot
     (error,) = read_answer(said.out).errors
     assert (said.code, error.what) == (1, "head is active already")
     assert (error.code, error.fields) == ("active_already", {"controller": ["head"]})
-    said = dxlrun("send", "heat", "posvel", "--json")
-    (error,) = read_answer(said.out).errors
-    assert (said.code, error.code, error.fields["controller"]) == (2, "unknown_controller", ["heat"])
-    said = dxlrun(
-        "send", "head", "posvel", "positions=[400 deg, 0 deg]", "velocities=[1 rpm, 1 rpm]", "--json"
-    )
-    (error,) = read_answer(said.out).errors
-    assert (said.code, error.code, error.fields["joints"]) == (2, "beyond_limits", ["head_pitch_joint"])
 
 
-def test_of_several_robots_one_must_be_chosen(dxlrun, torso: RemoteRobot, stage: Stage) -> None:
-    sockets = stage.directory / "dxlrun"
+def test_of_several_robots_one_must_be_chosen(dxlrun, torso: RemoteRobot, run: Running) -> None:
+    sockets = run.directory / "dxlrun"
     (sockets / "twin.sock").symlink_to(sockets / "bioloid_torso.sock")
     try:
         said = dxlrun("pause")
@@ -376,7 +329,7 @@ def test_every_command_of_a_running_robot_answers_in_one_form(dxlrun, torso: Rem
 
 
 def test_the_commands_of_the_page_work_in_their_order(
-    dxlrun, torso: RemoteRobot, stage: Stage, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    dxlrun, torso: RemoteRobot, run: Running, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (name,) = re.findall(r"where `(.+?)` is", PAGE)
     (file,) = re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)
@@ -392,5 +345,5 @@ def test_the_commands_of_the_page_work_in_their_order(
         assert (said.code, said.err) == (0, ""), line
     assert said.out == "bioloid_torso has ended\n"
     assert running() == ()
-    assert stage.ended() == 0
-    assert "bioloid_torso: " in stage.said
+    code, out, _ = run.finish()
+    assert (code, "bioloid_torso: " in out) == (0, True)

@@ -27,33 +27,16 @@ def own_rig(tmp_path: Path) -> Iterator[Rigs]:
         rig.close()
 
 
-@pytest.fixture(scope="module")
-def rigs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[str], Rig]]:
-    """Return a function that gives the rig of a robot which the tests of a module share while it runs."""
-    made: dict[str, Rig] = {}
-
-    def rig(name: str) -> Rig:
-        if name not in made or not made[name].robot.link.alive:
-            log = tmp_path_factory.mktemp("rig") / "run.mcap"
-            made[name] = virtual_rig(plan_of(ROBOTS / f"{name}.yaml"), log=log)
-        made[name].robot.link.each_cycle = lambda cycle: None
-        return made[name]
-
-    yield rig
-    for one in made.values():
-        one.close()
+@pytest.fixture
+def arm(own_rig: Rigs) -> Rig:
+    """A rig of an arm with two joints in a chain of controllers."""
+    return own_rig(ROBOTS / "effort_arm.yaml")
 
 
 @pytest.fixture
-def arm(rigs: Callable[[str], Rig]) -> Rig:
-    """A shared rig of an arm with two joints in a chain of controllers."""
-    return rigs("effort_arm")
-
-
-@pytest.fixture
-def single(rigs: Callable[[str], Rig]) -> Rig:
-    """A shared rig of one joint."""
-    return rigs("single_joint")
+def single(own_rig: Rigs) -> Rig:
+    """A rig of one joint."""
+    return own_rig(ROBOTS / "single_joint.yaml")
 
 
 @pytest.fixture

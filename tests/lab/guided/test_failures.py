@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 from tests.kit.campaigns import campaign
-from tests.kit.experiments import ROBOTS, Plays, Segments, perform, sine, state_of
+from tests.kit.experiments import Plays, Segments, perform, sine, state_of
 
 from dxlrun.channels.commands import LOOP, CommandMessage
 from dxlrun.errors import DxlrunError, Refused
@@ -23,8 +23,6 @@ from dxlrun_lab.guided.rig import RunningController
 from dxlrun_lab.guided.segment import Guard, Segment
 from dxlsim.faults.fault import parse_fault
 from dxlsim.faults.script import FaultScript
-
-ARM = ROBOTS / "effort_arm.yaml"
 
 
 def interrupted(rig: Any, act: Callable[[], object]) -> Segments:
@@ -55,9 +53,8 @@ def happen(rig: Any, fault: str) -> None:
     ],
     ids=["lost", "hot"],
 )
-def test_a_servo_that_is_lost_or_hot_ends_it_and_what_was_measured_is_kept(own_rig, fault, why, valid):
-    rig = own_rig(ARM)
-    _, done = perform(rig, "elbow", interrupted(rig, lambda: happen(rig, fault)))
+def test_a_servo_that_is_lost_or_hot_ends_it_and_what_was_measured_is_kept(arm, fault, why, valid):
+    _, done = perform(arm, "elbow", interrupted(arm, lambda: happen(arm, fault)))
     assert re.fullmatch(why, done.why)
     first, last = done.recorded
     assert (first.whole, last.whole, last.valid[-1].tolist()) == (True, False, valid)
@@ -65,34 +62,32 @@ def test_a_servo_that_is_lost_or_hot_ends_it_and_what_was_measured_is_kept(own_r
     assert np.nanmax(last.of_joints("temperature")) == (30 if valid == [False] else 75)
 
 
-def test_a_joint_whose_torque_is_switched_off_ends_it(own_rig):
-    rig = own_rig(ARM)
+def test_a_joint_whose_torque_is_switched_off_ends_it(arm):
     data = msgspec.json.encode({"joints": ["elbow"], "on": False, "release": True})
     off = CommandMessage(1_000_000, LOOP, "torque", data, "a person")
-    plays = Plays(interrupted(rig, lambda: rig.robot.link.gateways_link._mailbox.post_command(off)))
-    done = perform_experiment(rig, plays, situation_of(rig, ["elbow"], {}))
+    plays = Plays(interrupted(arm, lambda: arm.robot.link.gateways_link._mailbox.post_command(off)))
+    done = perform_experiment(arm, plays, situation_of(arm, ["elbow"], {}))
     assert done.why == "experiment_position was deactivated"
     assert [part.whole for part in done.recorded] == [True, False]
     (sentence,) = done.not_restored  # its controllers cannot be active without torque
     assert "elbow" in sentence
-    assert not [one for one in rig.controllers() if one.name.startswith("experiment")]
+    assert not [one for one in arm.controllers() if one.name.startswith("experiment")]
 
 
-def test_a_run_that_ends_in_the_middle_ends_it(own_rig):
-    rig = own_rig(ARM)
-    link = rig.robot.link
+def test_a_run_that_ends_in_the_middle_ends_it(arm):
+    link = arm.robot.link
     cycles = link.simulated.cycles
-    assert rig.rate == 400
-    assert rig.joints()
+    assert arm.rate == 400
+    assert arm.joints()
     assert link.simulated.cycles == cycles, "a look takes no cycle"
-    plays = Plays(interrupted(rig, link.simulated.stop.request))
-    done = perform_experiment(rig, plays, situation_of(rig, ["elbow"], {}))
+    plays = Plays(interrupted(arm, link.simulated.stop.request))
+    done = perform_experiment(arm, plays, situation_of(arm, ["elbow"], {}))
     assert done.why == "the run ended"
     assert done.not_restored == ("the run of effort_arm ended, so the run was not restored",)
     assert [part.outcome for part in done.recorded] == ["reached", "aborted"]
     assert len(done.recorded[1]) == pytest.approx(200, abs=15)
-    assert rig.joints()
-    for asked in (rig.change_rate, rig.robot.rate):
+    assert arm.joints()
+    for asked in (arm.change_rate, arm.robot.rate):
         with pytest.raises(RunGone, match="the run of effort_arm ended"):
             asked(100)
 
@@ -196,21 +191,20 @@ def many(rng: random.Random) -> Any:
 
 
 @campaign(ci=3, night=40, release=200)
-def test_an_abort_at_any_time_leaves_the_run_as_it_was(own_rig, number, chance):
+def test_an_abort_at_any_time_leaves_the_run_as_it_was(arm, number, chance):
     """On the way to a start, in a segment, while modes change or a player is loaded."""
-    rig = own_rig(ARM)
-    simulated, begin_s = rig.robot.link.simulated, rig.now_s
+    simulated, begin_s = arm.robot.link.simulated, arm.now_s
     at_s, lost_s = (begin_s + chance.uniform(0.0, 9.0) for _ in range(2))
     loses = number % 3 == 2  # a servo, which is back before all is restored
     print(f"aborted after {at_s - begin_s} s, lost after {lost_s - begin_s if loses else None} s")
     if loses:
-        simulated.buses[0].at(round(lost_s * 1e9), lambda: happen(rig, "silence servo=2 for=200ms"))
+        simulated.buses[0].at(round(lost_s * 1e9), lambda: happen(arm, "silence servo=2 for=200ms"))
 
-    _, done = perform(rig, "elbow", many(chance), lambda: "aborted by a key" if rig.now_s >= at_s else None)
+    _, done = perform(arm, "elbow", many(chance), lambda: "aborted by a key" if arm.now_s >= at_s else None)
     assert done.why == "" or done.why.startswith(("aborted by a key", "joint elbow "))
     assert all(part.whole for part in done.recorded[:-1])
     assert not simulated.robot.loop.steering.inbox.drain_commands()
-    limit_s = rig.now_s + 1.0
-    while rig.now_s < limit_s:
-        rig.robot.link.run_cycle()
+    limit_s = arm.now_s + 1.0
+    while arm.now_s < limit_s:
+        arm.robot.link.run_cycle()
     assert abs(simulated.record.states.velocity[1]) < 0.05, "the controllers of before hold it"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tests.kit.experiments import ROBOTS, perform, sine
+from tests.kit.experiments import perform, sine
 
 from dxlrun.log.log_reader import read_log
 from dxlrun_lab.guided.segment import Guard, Segment
@@ -12,9 +12,8 @@ from dxlrun_lab.guided.segment import Guard, Segment
 pytestmark = pytest.mark.long
 
 
-def test_a_segment_is_recorded_cycle_by_cycle_as_in_the_log(own_rig, tmp_path):
-    rig = own_rig(ROBOTS / "single_joint.yaml")
-    plays, done = perform(rig, "joint", lambda joint: iter([sine(joint, settle_s=0.1)]))
+def test_a_segment_is_recorded_cycle_by_cycle_as_in_the_log(single, tmp_path):
+    plays, done = perform(single, "joint", lambda joint: iter([sine(joint, settle_s=0.1)]))
     (got,) = plays.got
     assert done.recorded == (got,)
     assert len(got) == 320 + 32 + 1
@@ -25,7 +24,7 @@ def test_a_segment_is_recorded_cycle_by_cycle_as_in_the_log(own_rig, tmp_path):
     assert got.valid.all()
     assert (got.of_joints("voltage")[-1, 0], got.of_joints("temperature")[-1, 0]) == (12.0, 30.0)
     assert 0.2 - 0.05 < got.position.max() < 0.2 + 0.01
-    rig.close()
+    single.close()
     log = read_log(tmp_path / "0.mcap")
     rows = np.isin(log.cycles["cycle"], got.of_cycles("cycle"))
     for name in ("cycle", "woken_ns", "written_ns", "position", "age_ns", "valid"):
@@ -89,13 +88,13 @@ def test_joints_are_led_to_the_first_row_slowly_and_back(single):
     assert places[-1] == pytest.approx(0.0, abs=0.006)
 
 
-def test_a_joint_that_leaves_its_range_ends_the_experiment_and_the_rest_is_kept(own_rig):
+def test_a_joint_that_leaves_its_range_ends_the_experiment_and_the_rest_is_kept(arm):
     def segments(joint):
         yield sine(joint, 400)
         yield Segment("push", 1 / 400, {joint.name: np.full(4000, 0.9)}, interface="effort")
         raise AssertionError("nothing follows")
 
-    plays, done = perform(own_rig(ROBOTS / "effort_arm.yaml"), "elbow", segments)
+    plays, done = perform(arm, "elbow", segments)
     assert "joint elbow is at 0.5" in done.why
     assert "outside its range of -0.5236 to 0.5236 rad" in done.why
     assert [part.outcome for part in done.recorded] == ["reached", "aborted"]
@@ -114,14 +113,6 @@ def test_the_guard_of_a_segment_ends_it(arm, guard, sentence):
     _, done = perform(arm, "elbow", lambda joint: iter([sine(joint, 400, guard=guard)]))
     assert sentence in done.why
     assert not done.recorded[0].whole
-
-
-def test_two_performances_are_the_same(own_rig):
-    first, second = (
-        perform(own_rig(ROBOTS / "effort_arm.yaml"), "elbow", lambda joint: iter([sine(joint)]))[0]
-        for _ in range(2)
-    )
-    assert first.got[0].cycles.tobytes() == second.got[0].cycles.tobytes()
 
 
 @pytest.mark.parametrize(
