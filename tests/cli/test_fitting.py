@@ -70,19 +70,6 @@ def test_table_that_does_not_fit_becomes_paragraphs_in_which_nothing_is_cut(widt
     assert "\n".join(lines) == SHOWN[width]
 
 
-def test_long_text_is_folded_between_words() -> None:
-    columns = [Column("event", "name"), Column("text", "text")]
-    lines = shown(Table.from_rows("Events", columns, [("SETUP", "word " * 20)]), width=50).splitlines()
-    assert lines[:2] == ["", "Events"]
-    assert max(map(len, lines)) <= 50
-    assert " ".join(lines).split().count("word") == 20
-
-
-def test_row_needs_a_value_for_each_column() -> None:
-    with pytest.raises(ValueError, match="zip"):
-        Table.from_rows("", [Column("ID"), Column("model")], [(1,)])
-
-
 def test_only_a_terminal_gets_colours() -> None:
     assert "\x1b[31m" in shown(SERVOS, Sentence("bad", "error"), width=80, terminal=True)
     assert "\x1b" not in shown(SERVOS, Sentence("bad", "error"), width=80)

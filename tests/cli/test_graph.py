@@ -14,7 +14,6 @@ from rich.console import Console
 from tests.kit.answers import result_of
 from tests.kit.commands import Dxlrun, cases
 
-from dxlrun.cli.steering.steer import drawing
 from dxlrun.output.graph import Edge, Graph, Node, placed
 from dxlrun.output.graph_picture import graph_svg
 from dxlrun.output.graph_text import graph_text
@@ -96,19 +95,6 @@ def test_terminal_without_these_characters_gets_others() -> None:
     stream = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
     show_parts(GRAPH, console=Console(file=stream, width=120))
     assert b"position + velocity" in stream.buffer.getvalue()  # type: ignore[attr-defined]  # a BytesIO, given above
-
-
-def test_graph_of_a_running_robot_shows_what_is_active_now() -> None:
-    common = {"type": "part", "held": False, "rate": 50.0, "joints": ["j"], "reads": []}
-    up = {"name": "up", "active": False, "command": ["position"], "into": ["low"], "reference": []}
-    low = {"name": "low", "active": True, "command": ["effort"], "into": [], "reference": ["position"]}
-    shown = drawing({"rate": 100.0, "joints": ["j"], "controllers": [common | up, common | low]})
-    assert [(node.name, node.active, node.about) for node in shown.nodes] == [
-        ("up", False, "part, 50 Hz"),
-        ("low", True, "part, 50 Hz"),
-        ("joints j", True, ""),
-    ]
-    assert set(shown.edges) == {Edge("up", "low"), Edge("low", "joints j")}
 
 
 @settings(max_examples=50, deadline=None, suppress_health_check=[HealthCheck.too_slow])

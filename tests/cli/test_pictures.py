@@ -1,50 +1,17 @@
-"""The pages' pictures: the script that makes them works, and its check names a picture whose inputs changed.
-
-tests/test_reference.py runs that check on the pictures of the pages.
-"""
+"""The pages' pictures: their check names a picture whose inputs changed; tests/test_reference.py runs it."""
 
 from __future__ import annotations
 
-import html
 import json
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
-from tests.kit.awaited import DEADLINE_S
 from tests.kit.pages import PATHS
 
 ROOT = Path(__file__).parents[2]
 PICTURES = ROOT / "docs" / "pictures"
 NAMES = tuple(json.loads((PICTURES / "inputs.json").read_text()))
-SAME = ("check", "mistakes", "graph", "lost", "setup", "calibrate", "teach")
-"""Pictures of a terminal that are the same in each run, but for measured numbers."""
-OTHERS = ("terminal", "scan", "fall", "cycle", "setup_hands", "calibrate_hands", "teach_hands", "motion")
-"""Pictures that need neither Chromium nor minutes, and that the machine changes."""
-
-
-pytestmark = [pytest.mark.long, pytest.mark.timeout(300)]
-
-
-def words(path: Path) -> list[str]:
-    """Return the texts of a picture, with 0 for each number."""
-    texts = re.findall(r"<text[^>]*>(.*?)</text>", path.read_text(), re.DOTALL)
-    lines = [html.unescape(one).replace("\xa0", " ").strip() for one in texts]
-    return [re.sub(r"\d[\d.:-]*", "0", line) for line in lines if line]
-
-
-@pytest.mark.needs("report")
-@pytest.mark.parametrize("name", [*SAME, *OTHERS])
-def test_picture_can_be_made(tmp_path: Path, name: str) -> None:
-    make = [sys.executable, PICTURES / "make.py", name, "--into", tmp_path, "--virtual"]
-    ran = subprocess.run(make, check=False, capture_output=True, text=True, timeout=DEADLINE_S)
-    assert ran.returncode == 0, ran.stderr
-    made = words(tmp_path / f"{name}.svg")
-    assert made
-    if name in SAME:
-        assert made == words(PICTURES / f"{name}.svg")
 
 
 def test_check_names_the_picture_and_the_command_when_an_input_changed(

@@ -78,11 +78,6 @@ def test_help_of_a_verb_has_examples_that_can_be_typed(name: str, dxlrun: Dxlrun
         assert packaged.group in verb_registry.GROUPS
 
 
-def test_help_without_a_verb_lists_them(dxlrun: Dxlrun) -> None:
-    assert dxlrun("help").out == dxlrun("--help").out
-    assert len(verb_registry.GROUPS[verb_registry.EVERY_DAY]) == 10  # `help`, and with `analyze` ten more
-
-
 def test_foreign_verb_is_in_the_group_that_it_names_or_after_all(install: Install, dxlrun: Dxlrun) -> None:
     install("in-a-group", "grouped", greeting(Manners="Servos"))
     install("without-one", "lonely", greeting(**{', "Manners"': "", '"greet"': '"wave"'}))

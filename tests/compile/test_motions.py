@@ -37,10 +37,6 @@ def test_formulas_for_a_trajectory_controller_become_one_trajectory():
     assert compiled.plan.loop.end_ns == 9_000_000_000  # 3 s start, 1 s lead, 4 s long, 1 s to settle
 
 
-def test_duration_overrules_the_end_of_the_motions():
-    assert compile_text(SPARE_ACTIVE, FORMULAS, duration_ns=7).plan.loop.end_ns == 7
-
-
 def test_long_formulas_of_many_samples_are_refused_before_they_are_evaluated(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("dxlrun.compile.motion_samples.Expression.at", lambda *_: pytest.fail("evaluated"))
     long = FORMULAS.replace("samples: 5", "samples: 90_000").replace("t / 10", "+".join(["(t + t)"] * 120))

@@ -9,7 +9,7 @@ from tests.kit.robots import compile_text, robot_text
 
 from dxlrun import MotorModel, Stribeck
 from dxlrun.control.controllers.plugin_loading import load_plugins
-from dxlrun.description.joints.motor_file import motor_text, read_motor
+from dxlrun.description.joints.motor_file import read_motor
 from dxlrun.errors import InputError
 from dxlrun.plan.robot_plan import from_json, to_json
 from dxlrun.remote.preparation import Preparation, RefusedRequest
@@ -69,13 +69,6 @@ def test_file_is_looked_for_beside_the_file_that_names_it(motor: MotorModel) -> 
     plan = compile_text(f"include: [arms/joints.yaml]\n{head}").plan
     assert plan.simulation.motors["shoulder"] == motor
     assert sorted(plan.included) == ["arms/joints.yaml", "arms/shoulder.yaml"]
-
-
-def test_written_motor_is_in_the_plan_as_text(motor: MotorModel) -> None:
-    text = MOTOR_FILE.write_text(motor_text(motor, {})) and MOTOR_FILE.read_text()
-    plan = compile_text(ROBOT).plan
-    assert plan.included == {"shoulder.yaml": text}
-    assert plan.loop.joints[0].motor == motor
 
 
 def test_controller_of_a_running_robot_or_a_replay_needs_motors_too(motor: MotorModel) -> None:

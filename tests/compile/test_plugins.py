@@ -111,15 +111,6 @@ def test_what_a_controller_refuses_or_raises_is_a_problem(
 
 
 @pytest.mark.usefixtures("foreign_plugins")
-def test_controller_of_another_package_is_compiled_and_played():
-    plan = compile_text(FOREIGN, MOTION).plan.loop
-    (controller,) = plan.controllers
-    assert (controller.distribution, controller.command) == ("elsewhere 2.1", ("position",))
-    assert controller.joints == ("left_arm_joint", "right_arm_joint")
-    assert list(np.frombuffer(plan.commands[0].data)) == [1.0, 0.0]
-
-
-@pytest.mark.usefixtures("foreign_plugins")
 def test_its_topics_are_in_the_plan_and_none_is_that_of_a_bus():
     text = FOREIGN.replace("foreign", "publishing")
     (controller,) = compile_text(text).plan.loop.controllers
@@ -180,15 +171,6 @@ def test_only_packages_that_run_in_the_robot_are_in_its_plan(
     used = compile_text(f"{text}controllers: {{a: {{type: used}}}}\n").plan
     standard = {"dxlrun_controllers": "dxlrun"}  # the class is in this package
     assert used.packages == {**late, **standard, "used_plug_in": "used-robots"}
-
-
-def test_parameters_travel_as_they_were_written():
-    text = PAIR.replace("    active: false\n", "    active: false\n    tolerances: {goal: 5 deg}\n")
-    spare = compile_text(text).plan.loop.controllers[2]
-    offer = load_plugins().controllers[spare.type].controller
-    assert offer.Parameters.model_validate_json(spare.parameters).tolerances.goal == pytest.approx(
-        np.radians(5)
-    )
 
 
 def test_more_controllers_than_a_cycle_can_hold_are_refused():

@@ -1,18 +1,10 @@
 """Range of joints from the range of their servos, for every model."""
 
-import math
-
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from tests.kit.robots import compile_text
 
-from dxlrun.compile.joints.compiled_servos import joint_reach, servo_travel
-from dxlrun.compile.joints.limits import Interval
-from dxlwire.control_table import all_tables, find_table
+from dxlwire.control_table import all_tables
 
-TRAVEL = servo_travel(find_table("AX-12A"))
-INSIDE = st.floats(TRAVEL.lower, TRAVEL.upper)
 SPAN = """\
 name: span
 buses: {{main: {{port: sim, protocol: {protocol}, baud_rate: 1_000_000, adapter: {{latency: 0 ms}}}}}}
@@ -43,11 +35,3 @@ def test_a_reference_outside_of_a_travel_to_both_sides_of_0_is_a_warning(left: f
     text = SPAN.format(protocol=2.0, model="PH54-200-S500", left=left, right=-left)
     found = [one.what.partition("S500 ")[2] for one in compile_text(text).warnings]
     assert found == ["(-180..180 deg), so the joint cannot reach 0"] * count
-
-
-@settings(max_examples=50, deadline=None)
-@given(theta=INSIDE, reference=INSIDE, direction=st.sampled_from([-1, 1]))
-def test_every_angle_of_the_servo_lies_in_the_reach(theta: float, reference: float, direction: int):
-    q, reach = direction * (theta - reference), joint_reach(TRAVEL, reference, direction)
-    assert reach.contains(Interval(q, q))
-    assert reach.upper - reach.lower == pytest.approx(math.radians(300))

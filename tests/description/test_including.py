@@ -164,14 +164,6 @@ def test_fragments_that_cannot_be_read_are_named_at_the_include() -> None:
     ]
 
 
-def test_a_motion_includes_nothing() -> None:
-    (problem,) = desk.motion_refusals(
-        "name: m\ninclude: []\nmotions: [{controller: c, points: [{time: 0 s, joints: {j: "
-        "{position: 1 rad}}}]}]\n"
-    )
-    assert problem.startswith("motion.yaml:2:1: the file has an unknown key 'include'; remove it")
-
-
 KEYS = st.sampled_from(["a", "b", "c"])
 DOCUMENTS = st.dictionaries(
     KEYS, st.recursive(st.integers(0, 9), lambda below: st.dictionaries(KEYS, below), max_leaves=6)

@@ -79,6 +79,7 @@ DAMAGES = [
     ("swing: {position: 0}", "§swing: {velocity: 0}", "motions[1].joints.swing has no position; add"),
     ("name: wave", "name: §${x}", "this file cannot contain ${...}; write the value"),
     ("name: wave\n", "§", "the file has no name; add"),
+    ("name: wave\n", "name: wave\n§include: []\n", "the file has an unknown key 'include'; remove it"),
 ]  # fmt: skip
 
 

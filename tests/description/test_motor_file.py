@@ -7,7 +7,6 @@ import math
 import pytest
 from msgspec.structs import replace
 from tests.kit import desk
-from tests.kit.desk import TORSO
 
 from dxlrun import MotorLoad, MotorModel, Stribeck
 from dxlrun.description.joints.motor_file import MotorForm, UncertaintyForm, motor_text, read_motor
@@ -104,19 +103,6 @@ def test_each_mistake_is_told_at_its_place(right: str, wrong: str, sentence: str
     assert found.endswith(sentence)
     if wrong:
         assert found.startswith(f"elbow.motor.yaml:{place}: ")
-
-
-def test_all_mistakes_are_told_at_once() -> None:
-    path = desk.write(MOTOR.replace("12 V", "-12 V").replace("0.2 Nm", "0.2").replace("32", "no"))
-    assert len(desk.caught(lambda: read_motor(path))) == 3
-
-
-def test_another_file_is_no_motor_file() -> None:
-    path = desk.write(TORSO)
-    assert desk.caught(lambda: read_motor(path)) == [
-        "robot.yaml:1:1: this is not a motor file: voltage, torque_constant, resistance, inertia are missing; "
-        "give a motor file from `dxlrun identify`"
-    ]
 
 
 def test_each_figure_of_a_motor_is_a_key_of_the_file() -> None:
