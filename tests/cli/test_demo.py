@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from typing import Any
+from unittest.mock import Mock, call
 
 import pytest
 from tests.kit.commands import Dxlrun
@@ -31,33 +32,15 @@ def test_demo_is_the_first_command_of_the_readme(dxlrun: Dxlrun, monkeypatch: py
     assert [name.rpartition("/")[2] for name in files] == ["bioloid_torso.yaml", "three_parts.yaml"]
 
 
-class Served:
-    """Stands for the process that serves the page."""
-
-    def __init__(self, command: list[str]) -> None:
-        self.command = command
-        self.ended: list[str] = []
-
-    def terminate(self) -> None:
-        self.ended.append("terminate")
-
-    def wait(self) -> int:
-        self.ended.append("wait")
-        return 0
-
-
 @pytest.mark.parametrize("options", [{}, {"page": False}])
 def test_page_is_served_during_the_run_where_it_is_installed(
     monkeypatch: pytest.MonkeyPatch, options: dict[str, bool]
 ) -> None:
-    started: list[Served] = []
-
-    def start(command: list[str]) -> Served:
-        started.append(Served(command))
-        return started[-1]
+    start = Mock()
+    served = start.return_value
 
     def run(*_: object, **__: object) -> int:
-        assert [served.ended for served in started] == [[]] * len(started)
+        assert served.method_calls == []
         return 7
 
     monkeypatch.setattr(subprocess, "Popen", start)
@@ -65,8 +48,8 @@ def test_page_is_served_during_the_run_where_it_is_installed(
     monkeypatch.setattr(verb_registry, "packaged", lambda: {"view": object()})
     monkeypatch.setattr(sockets, "running", lambda: ("other",))
     assert run_room.demo(**options) == 7
-    assert [served.command[-1] for served in started] == ["other"] * (not options)
-    assert [served.ended for served in started] == [["terminate", "wait"]] * (not options)
+    assert [command[-1] for (command,), _ in start.call_args_list] == ["other"] * (not options)
+    assert served.method_calls == [call.terminate(), call.wait()] * (not options)
 
 
 def test_demo_without_the_page_names_the_package(

@@ -7,11 +7,9 @@ from itertools import combinations
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
-import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from rich.console import Console
-from tests.kit.answers import result_of
 from tests.kit.commands import Dxlrun, cases
 
 from dxlrun.output.graph import Edge, Graph, Node, placed
@@ -19,7 +17,7 @@ from dxlrun.output.graph_picture import graph_svg
 from dxlrun.output.graph_text import graph_text
 from dxlrun.output.terminal import show_parts
 
-ROBOTS = Path(__file__).parents[2] / "robots"
+SVG = "{http://www.w3.org/2000/svg}"
 NODES = (
     Node("reads", "source", ("wrist",), "temperature"),
     Node("arm", "controller", ("arm",), "position + velocity"),
@@ -27,35 +25,6 @@ NODES = (
     Node("joints", "joints", ("shoulder", "elbow")),
 )
 GRAPH = Graph("three", NODES, (Edge("reads", "pid"), Edge("arm", "pid"), Edge("pid", "joints")))
-
-
-@pytest.mark.parametrize("name", ["bioloid_torso", "humanoid_20", "diff_drive"])
-def test_picture_of_a_robot_has_all_in_it_and_nothing_over_another(
-    dxlrun: Dxlrun, tmp_path: Path, name: str
-) -> None:
-    path = tmp_path / "graph.svg"
-    assert (
-        f"the controller graph is in {path}" in dxlrun("check", ROBOTS / f"{name}.yaml", "--graph", path).out
-    )
-    root = ET.parse(path).getroot()  # noqa: S314  our own file
-    space = "{http://www.w3.org/2000/svg}"
-    controllers = result_of(dxlrun("check", ROBOTS / f"{name}.yaml", "--json").out)["controllers"]
-    texts = [text.text or "" for text in root.iter(f"{space}text")]
-    assert {one["name"] for one in controllers} <= set(texts)
-    for one in controllers:
-        assert any(text.startswith(f"{one['type']}, {one['rate']:g} Hz") for text in texts)
-    joints = {word.strip(",") for text in texts for word in text.split()}
-    assert {joint for one in controllers if one["command"] for joint in one["joints"]} <= joints
-    assert "prefers-color-scheme: dark" in path.read_text()
-    boxes = [
-        tuple(float(rect.get(key, "")) for key in ("x", "y", "width", "height"))
-        for rect in root.iter(f"{space}rect")
-        if rect.get("class") == "box"
-    ]
-    for (x, y, width, height), (x2, y2, width2, height2) in combinations(boxes, 2):
-        assert x + width <= x2 or x2 + width2 <= x or y + height <= y2 or y2 + height2 <= y
-    assert max(x + width for x, _, width, _ in boxes) < float(root.get("width", ""))
-    assert max(y + height for _, y, _, height in boxes) < float(root.get("height", ""))
 
 
 def test_dot_replaces_an_older_one_and_has_each_node_and_edge(dxlrun: Dxlrun, tmp_path: Path) -> None:
@@ -121,7 +90,28 @@ def test_any_graph_is_placed_with_each_edge_a_step_to_the_right(above: list[set[
     assert all(f"│ n{i}" in text for i in range(len(above)))
     assert text.count("▶") == len({edge.target for edge in edges})
     assert not set(text) & set("╴╵╶╷"), "a line ends in nothing"
-    ET.fromstring(graph_svg(graph))  # noqa: S314  our own text
+    check_picture(graph)
+
+
+def check_picture(graph: Graph) -> None:
+    """Check that a picture has each name, and no box over another one or beyond the edges."""
+    picture = graph_svg(graph)
+    root = ET.fromstring(picture)  # noqa: S314  our own text
+    assert "prefers-color-scheme: dark" in picture
+    assert {name for node in graph.nodes for name in node.lines} <= {
+        one.text for one in root.iter(f"{SVG}text")
+    }
+    boxes = [
+        tuple(float(box.get(key, "")) for key in ("x", "y", "width", "height"))
+        for box in root.iter(f"{SVG}rect")
+        if box.get("class") == "box"
+    ]
+    assert len(boxes) == len(graph.nodes)
+    for (x, y, width, height), (x2, y2, width2, height2) in combinations(boxes, 2):
+        assert x + width <= x2 or x2 + width2 <= x or y + height <= y2 or y2 + height2 <= y
+    for x, y, width, height in boxes:
+        assert x + width < float(root.get("width", ""))
+        assert y + height < float(root.get("height", ""))
 
 
 def test_lines_that_cross_differ_from_lines_that_are_joined() -> None:

@@ -11,6 +11,7 @@ from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import msgspec
 import pytest
@@ -34,7 +35,6 @@ from dxlrun.channels.event_records import (
 from dxlrun.errors import PortError
 from dxlrun.log.log_reader import read_log
 from dxlrun.plan.machine_load import MachineLoad, SimulationWait
-from dxlrun.plan.robot_plan import Plan
 from dxlrun.run.run_summary import RunOptions, RunStatusLine, RunSummary, run_verdict
 from dxlrun.run.virtual_run import VirtualRobot, run_virtual
 from dxlrun.testing import plan_of
@@ -43,24 +43,11 @@ Meanwhile = Callable[[float, Callable[[VirtualRobot], object]], None]
 GOOD = RunSummary(0, "ended", 100, 2, 2.03, (), events=EventTotals(goals=GoalTotals()))
 
 
-class Runs:
-    """Stands in for the supervisor; remembers what it was asked."""
-
-    def __init__(self) -> None:
-        self.asked: list[tuple[Plan, RunOptions]] = []
-        self.answer: RunSummary | Exception = GOOD
-
-    def run(self, plan: Plan, options: RunOptions, out: Console) -> RunSummary:
-        self.asked.append((plan, options))
-        if isinstance(self.answer, Exception):
-            raise self.answer
-        return self.answer
-
-
 @pytest.fixture
-def runs(monkeypatch: pytest.MonkeyPatch) -> Runs:
-    runs = Runs()
-    monkeypatch.setattr("dxlrun.run.supervisor.run_robot", runs.run)
+def runs(monkeypatch: pytest.MonkeyPatch) -> Mock:
+    """Stand in for the supervisor, which is given a plan and options."""
+    runs = Mock(return_value=GOOD)
+    monkeypatch.setattr("dxlrun.run.supervisor.run_robot", runs)
     return runs
 
 
@@ -80,10 +67,10 @@ def meanwhile(reader: Path, monkeypatch: pytest.MonkeyPatch) -> Meanwhile:
     return meanwhile
 
 
-def test_options_reach_plan_and_run(dxlrun: Dxlrun, runs: Runs, torso: Path, three_parts: Path) -> None:
+def test_options_reach_plan_and_run(dxlrun: Dxlrun, runs: Mock, torso: Path, three_parts: Path) -> None:
     said = dxlrun(torso, "rate:=25", "--play", three_parts, "--duration", "1.5", "--no-record", "--take-over")
     assert said.code == 1, "no motion of the plan began"
-    ((plan, options),) = runs.asked
+    (plan, options, _), _ = runs.call_args
     assert options == RunOptions(record=False, take_over=True, debug=False)
     assert (plan.loop.period_ns, plan.loop.end_ns) == (40_000_000, 1_500_000_000)
     assert {c.controller for c in plan.loop.commands} == {"head", "left_arm", "right_arm"}
@@ -163,9 +150,9 @@ def totals(group: EventGroup) -> EventTotals:
     ],
 )
 def test_counts_and_events_of_a_run_make_its_verdict(
-    *, dxlrun: Dxlrun, runs: Runs, torso: Path, changed: dict[str, Any], code: int, shown: list[str]
+    *, dxlrun: Dxlrun, runs: Mock, torso: Path, changed: dict[str, Any], code: int, shown: list[str]
 ) -> None:
-    runs.answer = replace(GOOD, **{"skipped": 0, **changed})
+    runs.return_value = replace(GOOD, **{"skipped": 0, **changed})
     said = dxlrun(torso)
     assert said.code == code
     first, *lines = said.out.splitlines()
@@ -196,9 +183,9 @@ def test_counts_and_events_of_a_run_make_its_verdict(
     ],
 )
 def test_bad_run_prints_the_reason_on_stderr(
-    *, dxlrun: Dxlrun, runs: Runs, torso: Path, answer: RunSummary, out: str, errors: list[str] | None
+    *, dxlrun: Dxlrun, runs: Mock, torso: Path, answer: RunSummary, out: str, errors: list[str] | None
 ) -> None:
-    runs.answer = answer
+    runs.return_value = answer
     said = dxlrun(torso)
     assert said.code == answer.exit_code
     assert said.out.startswith(f"bioloid_torso: {out}")
@@ -207,20 +194,20 @@ def test_bad_run_prints_the_reason_on_stderr(
 
 
 def test_real_servos_of_a_busy_machine_are_not_to_be_simulated(
-    dxlrun: Dxlrun, runs: Runs, torso: Path
+    dxlrun: Dxlrun, runs: Mock, torso: Path
 ) -> None:
-    runs.answer = replace(GOOD, run_load=BUSY)
+    runs.return_value = replace(GOOD, run_load=BUSY)
     assert dxlrun(torso, "port:=/dev/ttyUSB0").out.splitlines()[1].endswith(" s. End other programs.")
 
 
-def test_port_that_cannot_be_opened_is_one_sentence(dxlrun: Dxlrun, runs: Runs, torso: Path) -> None:
-    runs.answer = PortError("port /dev/ttyUSB7 does not exist; plug the adapter in")
+def test_port_that_cannot_be_opened_is_one_sentence(dxlrun: Dxlrun, runs: Mock, torso: Path) -> None:
+    runs.side_effect = PortError("port /dev/ttyUSB7 does not exist; plug the adapter in")
     said = dxlrun(torso, "port:=/dev/ttyUSB7")
-    assert (said.code, said.errors[1:]) == (1, [f"dxlrun: {runs.answer}"])
+    assert (said.code, said.errors[1:]) == (1, [f"dxlrun: {runs.side_effect}"])
 
 
 def test_played_motion_that_missed_its_goal_fails_the_run(
-    dxlrun: Dxlrun, runs: Runs, torso: Path, three_parts: Path
+    dxlrun: Dxlrun, runs: Mock, torso: Path, three_parts: Path
 ) -> None:
     plan = plan_of(torso, play=[three_parts])
     own = plan.loop.commands[0].origin
@@ -233,7 +220,7 @@ def test_played_motion_that_missed_its_goal_fails_the_run(
             if one.goal is not None:
                 history.count_report(GoalReport(1, one.controller, one.kind, one.origin, "accepted"))
         history.count_report(GoalReport(1, "left_arm", "trajectory", origin, status, text, "elbow", 0.157))
-        runs.answer = replace(GOOD, events=EventTotals(goals=history.totals), **ran)
+        runs.return_value = replace(GOOD, events=EventTotals(goals=history.totals), **ran)
         return dxlrun(torso, "--play", three_parts)
 
     assert ends("missed", "a client").code == 0
@@ -250,9 +237,9 @@ def test_played_motion_that_missed_its_goal_fails_the_run(
 
 
 def test_goals_of_a_loop_that_was_killed_are_unknown(
-    dxlrun: Dxlrun, runs: Runs, torso: Path, three_parts: Path
+    dxlrun: Dxlrun, runs: Mock, torso: Path, three_parts: Path
 ) -> None:
-    runs.answer = replace(GOOD, exit_code=1, reason="fault", events=EventTotals(), log="a.mcap")
+    runs.return_value = replace(GOOD, exit_code=1, reason="fault", events=EventTotals(), log="a.mcap")
     unknown = "reached their goals is unknown: the loop did not say so; dxlrun analyze a.mcap reads it from"
     assert unknown in (said := dxlrun(torso, "--play", three_parts)).out
     assert (said.code, "never began" in said.out) == (1, False)

@@ -180,7 +180,7 @@ def laid_over(low: dict[str, Any], high: dict[str, Any]) -> dict[str, Any]:
 
 
 def leaves(value: object, path: KeyPath = ()) -> dict[KeyPath, object]:
-    if not isinstance(value, dict):
+    if not isinstance(value, dict) or not value:
         return {path: value}
     return {k: v for key, below in value.items() for k, v in leaves(below, (*path, key)).items()}
 
@@ -195,6 +195,6 @@ def test_merging_is_deep_and_each_value_keeps_the_mark_of_its_file(documents: li
         file = int(result.marks.value(*path).file)
         assert leaves(documents[file])[path] == value
         assert not any(path in leaves(later) for later in documents[file + 1 :])
-    places = {path[:end] for path in result.marks.values for end in range(len(path) + 1)}
-    assert places == set(result.marks.values)  # no mark without its parents
+    places = {path[:end] for path in leaves(result.data) for end in range(len(path) + 1)}
+    assert set(result.marks.values) == places  # none of what was replaced
     assert set(result.marks.keys) == set(result.marks.values) - {()}
