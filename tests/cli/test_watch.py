@@ -77,7 +77,7 @@ class Robot:
         loop = SimpleNamespace(joints=joints, source_units=UNITS, command_units={})
         plan: Any = SimpleNamespace(loop=loop, servos_by_joint={})
         found = states_of(plan, record, {name: place for place, name in enumerate(layout.controllers)})
-        return replace(found, effort_units=("A",) * rows)
+        return replace(found, effort_units=("A", *[""] * (rows - 1)))
 
     def events(self, after: int) -> dict[str, Any]:
         one = {"name": "gate", "source": "arm", "text": "something\nhappened " + "x" * 200}
@@ -158,7 +158,18 @@ def test_pipe_gets_one_snapshot(shown: Shown) -> None:
     code, said = shown(robot)
     assert (code, robot.asked) == (0, 1)
     assert "humanoid: 50 Hz, cycle 50" in said
-    texts = ("34.4", "28.6", "0.12 A", "57.3/s", "limp error 0x20", "lost", "on silent", "arm_pid", "spare")
+    texts = (
+        "34.4",
+        "28.6",
+        "0.12 A",
+        "12 %",
+        "57.3/s",
+        "limp error 0x20",
+        "lost",
+        "on silent",
+        "arm_pid",
+        "spare",
+    )
     assert [text for text in texts if text not in said] == []
     assert "-0.0" not in said
     assert "\x1b" not in said

@@ -10,7 +10,7 @@ import pytest
 from dxlrun.errors import InputError
 from dxlrun.testing import plan_of
 from dxlrun_lab.commands.on_robot import RobotFileArguments
-from dxlrun_lab.guided.choice import check_joints, parse_ranges, situation_of
+from dxlrun_lab.guided.choice import check_joints, parse_ranges, situation_of, whole_situation
 from dxlrun_lab.guided.virtual_rig import virtual_rig
 
 ROBOT = """\
@@ -51,6 +51,11 @@ def test_a_range_is_used_as_given_or_is_around_the_joint_within_its_limits(rig):
     assert joints[0].upper == pytest.approx(4 * math.pi)
 
 
+def test_whole_range_is_that_of_the_limits_with_room_for_an_overshoot(rig):
+    (joint,) = whole_situation(rig, ["narrow"]).joints
+    assert [math.degrees(end) for end in (joint.lower, joint.upper)] == pytest.approx([-25, 95], abs=0.1)
+
+
 @pytest.mark.parametrize(
     ("names", "degrees", "sentences"),
     [
@@ -85,6 +90,7 @@ def test_everything_that_is_wrong_with_ranges_is_refused_at_once(rig, names, deg
         ("elbow=3deg", "write JOINT=LOWEST..HIGHEST, such as elbow=-30deg..30deg"),
         ("elbow=3..5deg", "'3' has no unit; write an angle with its unit"),
         ("elbow=5deg..3deg", "set HIGHEST at least 2 deg above LOWEST"),
+        ("elbow=3deg..4deg", "set HIGHEST at least 2 deg above LOWEST"),
         ("elbow=nan deg..3deg", ""),
     ],
 )
