@@ -203,13 +203,6 @@ def test_mx_of_protocol_2_has_no_startup_configuration_in_any_source() -> None:
         assert not set(STARTUP.values()) & find_table(model, 2.0).items.keys()
 
 
-def test_the_sdk_is_still_wrong_about_what_we_correct() -> None:
-    assert "value_of_max_radian_position\t4095" in (FOLDER / "xl320.model").read_text("utf-8")
-    assert "value_of_min_radian_position\t0" in (FOLDER / "xm430_w350.model").read_text("utf-8")
-    assert "262144" in (FOLDER / "ym070_210_r051.model").read_text("utf-8")
-    assert "xw430_t200" not in NUMBERS
-
-
 # The maker's examples
 
 
