@@ -175,6 +175,14 @@ def test_goals_keep_within_the_servos_own_limit_beyond_which_it_would_refuse_the
         assert rig.servo(1).registers.ticks(item) == held
 
 
+def test_joint_of_a_second_bus_changes_its_own_mode():
+    x = {"model": "XM430-W350", "protocol": 2.0, "reference": np.pi, "return_delay_ns": 0}
+    rig = start_rig(make_plan((1,), **x), make_plan((2,), name="other", first_row=1, **x))
+    for row in (0, 1):
+        change(rig, V, rows=(row,))
+    assert rig.servo(2, bus=1).registers["operating_mode"] == 1
+
+
 def test_of_two_modes_that_are_selected_alike_the_one_of_the_start_counts():
     """An AX in wheel mode follows a velocity or a PWM by the same register."""
     wheel = {"cw_angle_limit": 0, "ccw_angle_limit": 0}

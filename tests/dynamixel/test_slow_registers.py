@@ -42,6 +42,15 @@ def test_temperature_and_voltage_come_into_the_states_at_their_own_rate(plan):
     assert all(9 <= reading.count(block) <= 11 for block in blocks)  # once a second
 
 
+def test_values_of_a_second_bus_are_shown_at_its_joints():
+    slow = slow_items(find_table("XM430-W350", 2.0))
+    plans = [make_x((11,)), make_x((21,), name="leg", first_row=1)]
+    rig = start_rig(*(every_servo(replace(plan, slow_period_ns=SECOND_NS), slow=slow) for plan in plans))
+    rig.servo(21, bus=1).set_voltage(11.0)
+    rig.cycles(60)
+    assert rig.states.voltage.tolist() == pytest.approx([12.0, 11.0])
+
+
 def test_slow_registers_make_no_cycle_late_and_wait_for_ever_where_there_is_no_time():
     for period_ns, known in ((2_000_000, True), (1_000_000, False)):  # the exchange takes 0.85 ms
         rig = start(slow_period_ns=20_000_000)
