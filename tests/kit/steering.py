@@ -192,6 +192,11 @@ class Story(QueueInbox):
                 self.act(action)
         return super().drain_commands()
 
+    def answer_command(self, number: int, answer: Any) -> None:
+        before = self.answers.get(number)
+        assert before is None or isinstance(before, Acceptance), f"{number} is answered twice: {answer}"
+        super().answer_command(number, answer)
+
     def see(self, kind: RecordKind, payload: Any) -> None:
         """Keep an event, or what is active in a cycle."""
         if kind == RecordKind.TAGGED:
