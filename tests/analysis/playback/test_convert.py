@@ -71,10 +71,10 @@ def test_the_file_says_where_it_comes_from_and_is_never_written_over(
 
 def test_controllers_of_single_positions_get_them_every_20_ms(tmp_path: Path) -> None:
     """A joint that becomes slow at the end gets a speed at which it still arrives."""
-    time = np.linspace(0.0, 2.0, 101)
-    position = np.stack([0.5 * np.sin(time * np.pi / 4), np.zeros(101), 0.3 * np.sin(time)], axis=1)
-    joints = ("pan", "wheel", "tilt")
-    motion = RecordedMotion(Path("log"), joints, ("states",) * 3, time, position, 0.0, (ROTARY,) * 3)
+    time, zero = np.linspace(0.0, 2.0, 101), np.zeros(101)
+    position = np.stack([1.5 * np.sin(time * np.pi / 4), zero, 0.3 * np.sin(time), zero], axis=1)
+    joints = ("pan", "wheel", "tilt", "neck")
+    motion = RecordedMotion(Path("log"), joints, ("states",) * 4, time, position, 0.0, (ROTARY,) * 4)
     head = ControllerPlan(
         name="head",
         type="joint_group_posvel_controller",
@@ -88,14 +88,17 @@ def test_controllers_of_single_positions_get_them_every_20_ms(tmp_path: Path) ->
     )
     group = "joint_group_position_controller"
     tail = structs.replace(head, name="tail", type=group, joints=("tilt",), command=("position",))
-    speeds = {"pan": math.inf, "wheel": 0.2, "tilt": math.inf}
-    allowed, file = np.full(3, math.radians(0.5)), tmp_path / "slow.yaml"
-    file.write_text(motion_file(motion, allowed, file, None, "", plans=[head, tail], speeds=speeds).text)
+    rests = structs.replace(tail, name="rests", joints=("neck",))
+    speeds = dict.fromkeys(joints, math.inf) | {"wheel": 0.2}
+    allowed, file, plans = np.full(4, math.radians(0.5)), tmp_path / "slow.yaml", [head, tail, rests]
+    file.write_text(motion_file(motion, allowed, file, None, "", plans=plans, speeds=speeds).text)
     parts = {part.controller: part.points for part in read_motion_file(file).motion.motions}
+    assert [point.time for point in parts.pop("rests")] == [1_000_000_000, 3_000_000_000]
     for points in parts.values():
         assert points[0].time == 1_000_000_000
         assert np.diff([point.time for point in points]).min() == pytest.approx(20_000_000, abs=1_000_000)
     assert {target.velocity for point in parts["tail"] for target in point.joints.values()} == {None}
+    assert parts["head"][1].joints["pan"].velocity == pytest.approx(1.5 * np.pi / 4, rel=0.02)
     last = parts["head"][-1].joints
     assert (last["pan"].velocity, last["wheel"].velocity) == pytest.approx((0.5, 0.2))
 
