@@ -41,8 +41,8 @@ def health_of(
     servos = [{"joint": name, "servo_id": i, "row": i, "model": model} for i, name in enumerate(NAMES)]
     plan = json.dumps({"buses": [{"name": "main", "protocol": 2.0, "servos": servos}]}).encode()
     health, log = ServoHealth(), {"metadata": {}, "joints": NAMES, "attachments": {"plan.json": plan}}
-    for begin in range(0, len(TIME), 300):
-        part: Any = SimpleNamespace(cycles=cycles[begin : begin + 300], **log)
+    for slice_of in np.split(cycles, range(10, len(TIME), 10)):  # new voltages are in first cycles
+        part: Any = SimpleNamespace(cycles=slice_of, **log)
         health.add_slice(part)
     return health
 

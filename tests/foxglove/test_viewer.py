@@ -46,10 +46,18 @@ def test_the_oldest_messages_are_left_out_for_a_slow_viewer() -> None:
         sending = asyncio.create_task(viewer.send_queued())
         while len(connection.taken) < most + 1:
             await asyncio.sleep(0)
+        await asyncio.sleep(0)
         sending.cancel()
         assert json.loads(connection.taken[0])["message"] == SLOW
         numbers = [int.from_bytes(frame[5:13], "little") for frame in connection.taken[1:]]
         assert numbers == list(range(2 * most, 3 * most))  # the newest, in order
+        for number in range(3 * most):  # a second time, which is reported again
+            viewer.queue_message(CHANNEL, number, b"x" * 1000)
+        sending = asyncio.create_task(viewer.send_queued())
+        while len(connection.taken) < 2 * most + 1:
+            await asyncio.sleep(0)
+        sending.cancel()
+        assert json.loads(connection.taken[most + 1])["message"] == SLOW
         assert connection.aborted == 0
 
     asyncio.run(run())
