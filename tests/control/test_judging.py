@@ -71,6 +71,19 @@ def test_a_joint_is_judged_by_its_own_tolerance_where_the_goal_moves_it_alone(to
     assert (goal.outcome, goal.joint) == (outcome, "b")
 
 
+@pytest.mark.parametrize("velocity", [0.5, -0.5])
+def test_a_goal_waits_until_its_joints_are_at_rest(velocity):
+    judged = Judged()
+    goal = judged.accept()
+    judged.states.velocity[1] = velocity
+    goal.judge(np.zeros(2))
+    judged.cycles(1)
+    assert goal.outcome is None
+    judged.states.velocity[1] = 0.0
+    judged.cycles(1)
+    assert goal.outcome is Outcome.REACHED
+
+
 def test_a_lost_reply_at_the_end_of_a_motion_does_not_end_a_goal_without_settling_time():
     judged = Judged((0, 0))
     goal = judged.accept()

@@ -164,6 +164,13 @@ def test_a_controller_is_updated_at_its_own_rate_with_its_true_period_at_most_fi
     assert max(periods) == 5 * PERIOD_NS
 
 
+def test_the_first_update_after_an_activation_has_the_nominal_period(robot):
+    at = {3: robot.switches((), ("left",)), 7: robot.switches(("left",))}
+    robot.script("left").run(9, at)
+    updates = [(call.cycle, call.value) for call in robot.calls if call.step == "update"]
+    assert updates == [(cycle, PERIOD_NS) for cycle in (0, 1, 2, 7, 8)]
+
+
 def test_masks_show_which_controllers_are_active_and_which_publish(robot):
     def speaks(context, time_ns, _):
         if time_ns == PERIOD_NS:

@@ -227,6 +227,19 @@ def test_a_driver_that_raises_is_an_event_and_is_opened_again(crane, tmp_path, m
     assert len(closed) == 2  # then, and at the end
 
 
+def test_a_value_that_its_driver_leaves_out_is_not_that_of_the_sample_before(crane, monkeypatch):
+    robot = VirtualRobot(plan_of(crane(), duration_s=1.0))
+    set_values = iter([slice(None)])  # all in the first sample, then the first one only
+
+    def read(values: np.ndarray) -> int:
+        values[next(set_values, slice(1))] = 1.0
+        return robot.clock.now_ns()
+
+    monkeypatch.setattr(robot.drivers["imu"], "read", read)
+    robot.run()
+    assert not robot.record.sources.valid.any()
+
+
 @pytest.mark.parametrize("part", ["source", "controller"])
 def test_source_is_closed_when_a_later_part_cannot_start(crane, monkeypatch, part):
     opened: list[SampledSource] = []
