@@ -9,7 +9,7 @@ The texts in `scripts` have the form of `tests/kit/cases.py`; the head is a cont
 
 Before the activation: `keys` of the controller, `with` options of its stage (`tests.kit.stages`), and
 `before`, which has what was `sent` and `measured`. Then: commands by their names; `change` of keys; `cancel`,
-`activate`, `deactivate`; `measured`, `sent`, `references` and `reads`; `servos` that `stay`, `follow` or
+`activate`, `deactivate`, `restart`; `measured`, `sent`, `references` and `reads`; `servos` that `stay`, `follow` or
 `move` at the commanded velocity, upward as far as an `obstacle`.
 `at` updates at these times, s, and `steps` in so many cycles. `=>` has what is expected:
 
@@ -174,7 +174,7 @@ class Scene:
             stage.change(at_s, **parsed(rest))
         elif word == "cancel":
             stage.cancel(at_s)
-        elif word in ("activate", "deactivate"):
+        elif word in ("activate", "deactivate", "restart"):
             getattr(stage.controller, f"on_{word}")(stage.time_ns)
         elif word in ("measured", "sent", "references", "reads"):
             self.put(word, parsed(rest))
