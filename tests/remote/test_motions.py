@@ -16,6 +16,7 @@ from dxlrun.control.controllers.plugin_loading import Offer, PlugIns
 from dxlrun.plan.loop_plan import ControllerPlan, JointPlan, ServoLimit
 from dxlrun.remote import gateway
 from dxlrun.remote.preparation import Preparation
+from dxlrun.remote.requests.request_table import Role
 from dxlrun_controllers import group
 from dxlrun_controllers.motions.joint_trajectory_controller import JointTrajectoryController
 
@@ -145,6 +146,20 @@ motions:
     )
 
 
+def test_the_speed_scales_accelerations_by_its_square(head):
+    activate(head, "arm")
+    point = "{time: %s s, joints: {tilt: {position: %s rad, velocity: 0 rad/s, acceleration: %s rad/s^2}}}"
+    points = ", ".join(point % one for one in ((0, 0.2, 0.4), (1, 0.4, -0.8)))
+    _, _, (arm,) = play(head, f"{HEAD % 'arm'}    points: [{points}]\n", 0.5)
+    rows = [(0.0, 0.2, 0.1), (2.0, 0.4, -0.2)]
+    points = [{"time": t, "positions": [at], "velocities": [0.0], "accelerations": [a]} for t, at, a in rows]
+    command = JointTrajectoryController.Commands["trajectory"](points=points, start_in=0.0)
+    parameters = JointTrajectoryController.Parameters(joints=("tilt",))
+    np.testing.assert_allclose(
+        arm[3][0], JointTrajectoryController.prepare("trajectory", command, parameters), atol=1e-12
+    )
+
+
 def test_wheels_have_no_way_to_a_first_pose(head):
     activate(head, "wheel")
     text = "name: roll\nmotions:\n  - controller: wheel\n    points: [{time: 0 s, joints: {tilt: {velocity: 1 rad/s}}}]\n"
@@ -249,6 +264,19 @@ def test_a_motion_is_not_played_for_a_client_that_has_hung_up_meanwhile(head):
     chunks = [{"type": "http.request", "body": body}]
     assert head.ask("POST", "/play", chunks=chunks)[0] == 200
     assert [command.kind for command in head.taken] == ["play"]
+
+
+def test_a_motion_is_not_played_for_a_client_that_lost_the_command_meanwhile(head, monkeypatch):
+    real = gateway.computed
+
+    async def computed(*words):
+        await head.request("POST", "/take-over", client=("anna", Role.ADMIN))
+        return await real(*words)
+
+    monkeypatch.setattr(gateway, "computed", computed)
+    status, answer = head.ask("POST", "/play", {"text": NOD}, client=("bert", Role.COMMAND))
+    assert (status, answer["code"]) == (409, "commanded_by")
+    assert {one.kind for one in head.taken} == {"commander"}
 
 
 def test_a_failure_in_the_check_of_a_motion_is_that_of_one_request(head, monkeypatch):

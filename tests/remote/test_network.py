@@ -136,6 +136,12 @@ def test_each_role_may_what_the_table_has_and_the_loop_gets_nothing_else(desk):
         desk.now += 2 * LEASE_S
     looks = [one for one in REQUESTS if one.role is Role.OBSERVE]
     assert {one.method for one in looks} == {"GET"}
+    assert {(one.method, one.path) for one in REQUESTS if one.role is Role.ADMIN} == {
+        ("POST", "/controllers"),
+        ("DELETE", "/controllers/{name}"),
+        ("POST", "/joints/{name:path}/registers/{item}"),
+        ("POST", "/rate"),
+    }
     assert {one.method for one in REQUESTS} - {"GET"} <= {"POST", "DELETE"}
 
 
@@ -184,12 +190,13 @@ def test_a_clients_certificate_is_none_of_a_robot_and_a_robots_none_of_a_client(
 
 
 def test_a_revoked_certificate_is_refused_at_once_also_on_a_connection_that_is_open(net):
-    (one,) = [one for one in authority.issued() if one.name == "command"]
+    one, other = ([one for one in authority.issued() if one.name == name] for name in ("command", "observe"))
 
     def act():
         with net.robot("command") as robot:
             robot.halt()
-            authority.revoke(one)
+            authority.revoke(*one)
+            authority.revoke(*other)
             try:
                 for _ in range(2):
                     with pytest.raises(DxlrunError, match="is expired, revoked or"):
