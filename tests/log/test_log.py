@@ -368,6 +368,16 @@ def test_full_disk_stops_the_writing_and_leaves_a_readable_log(
     assert (len(read.cycles), read.complete) == (1, False)
 
 
+def test_chunk_of_which_the_disk_takes_a_part_at_a_time_is_whole(
+    log: LogWriter, path: Path, cycle: Cycle, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write = os.write
+    monkeypatch.setattr(os, "write", lambda file, data: write(file, data[:100]))
+    log.write_record(RecordKind.CYCLE, cycle(0))
+    assert log.close().error is None
+    assert read_log(path).complete
+
+
 def test_disk_that_is_full_at_the_end_is_reported(log: LogWriter, path: Path, cycle: Cycle) -> None:
     log.write_record(RecordKind.CYCLE, cycle(0))
     with files_of_at_most(path.stat().st_size):
