@@ -5,13 +5,27 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from tests.analysis.judged import check_case
+from msgspec import structs
+from tests.analysis.judged import COMMANDS, NO_LOOP, check_case
 from tests.kit.cases import TextCase, case_parameters, read_cases
+
+from dxlrun.channels.event_records import GoalTotals
+from dxlrun.plan.played_goals import find_unreached_goals
 
 
 @pytest.mark.parametrize("case", case_parameters(Path(__file__).with_name("totals.txt")))
 def test_verdict_on_totals(case: TextCase) -> None:
     check_case(case)
+
+
+@pytest.mark.parametrize("begun", [0, 1, 2])
+def test_each_goal_of_a_motion_that_is_played_twice_has_to_begin(begun: int) -> None:
+    loop, goals = (
+        structs.replace(NO_LOOP, commands=COMMANDS[:1] * 2),
+        GoalTotals(begun={COMMANDS[0].origin: begun}),
+    )
+    never = [goal.sentence for goal in find_unreached_goals(loop, goals, 60_000_000_000)]
+    assert never == ["wave of arm never began"] * (2 - begun)
 
 
 @pytest.mark.parametrize(

@@ -117,6 +117,11 @@ def totals(group: EventGroup) -> EventTotals:
             ],
         ),
         (
+            {"events": EventTotals((replace(LOST, source="neck", t_ns=3 * 10**9), LOST))},
+            1,
+            ["neck, head were lost at 1.0 s"],
+        ),
+        (
             {"events": totals(TAKEOVER)},
             0,
             ["done: at 0.1 s reflex took over the robot: it falls; ran for 2.0 s.", KEPT],

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -12,6 +14,8 @@ from dxlrun.channels.heartbeat import (
     SimulationProgress,
     create_progress,
 )
+from dxlrun.description.bus import SIMULATED
+from dxlrun.run.guardian import make_ports
 from dxlsim.serving.host import ENDLESS_NS
 from dxlwire.port.ports import LONGEST_STALL_NS, SerialPort, SimulatedPort, StallCounter
 
@@ -62,6 +66,18 @@ def test_deadline_counts_from_when_the_request_was_taken(port, simulation):
     assert extended(port, SENT + 101 * MS) > SENT + 101 * MS
     simulation.publish_served(ENDLESS_NS)  # nothing is due any more: the servo is silent on purpose
     assert extended(port, SENT + 102 * MS) <= SENT + 102 * MS
+
+
+def test_each_simulated_bus_has_its_own_progress(memory, simulation, stalls):
+    ours, theirs = os.pipe()
+    buses: Any = [SimpleNamespace(port=SIMULATED)] * 2
+    lines: Any = SimpleNamespace(simulation=memory)
+    first, second = make_ports(buses, ("one", "two"), (ours, theirs), lines, stalls)
+    simulation.publish_served(ENDLESS_NS)
+    simulation.publish_received(SENT + MS // 10)
+    assert extended(second, DEADLINE) <= DEADLINE < extended(first, DEADLINE)
+    os.close(ours)
+    os.close(theirs)
 
 
 def test_silent_servo_of_a_running_process_is_given_up_at_once(port, simulation, stalls):

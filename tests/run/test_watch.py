@@ -651,6 +651,13 @@ def test_a_supervisor_waits_for_a_guardian_only_shortly_once_torque_is_to_be_cut
         os.close(run.loop)
 
 
+@pytest.mark.parametrize(("sentences", "code"), [([], 0), (["3 records are missing in the log"], 1)])
+def test_a_run_whose_supervisor_reports_a_failure_has_failed(plan, sentences, code):
+    run = supervisor._Run(plan, RunOptions(), create_memory(plan), Console(file=io.StringIO()))
+    run.ended, run.sentences = Ended("done"), sentences
+    assert supervisor._summary(run, 1.0).exit_code == code
+
+
 def test_waits_for_simulated_servos_are_reported_once_a_second() -> None:
     reported: list[Event] = []
     clock = VirtualClock(10**10)
