@@ -9,8 +9,8 @@ The texts in `scripts` have the form of `tests/kit/cases.py`; the head is a cont
 
 Before the activation: `keys` of the controller, `with` options of its stage (`tests.kit.stages`), and
 `before`, which has what was `sent` and `measured`. Then: commands by their names; `change` of keys; `cancel`,
-`activate`, `deactivate`, `restart`; `measured`, `sent`, `references` and `reads`; `servos` that `stay`, `follow` or
-`move` at the commanded velocity, upward as far as an `obstacle`.
+`activate`, `deactivate`, `restart`; `measured`, `sent`, `references` and `reads`; `servos` that `stay`,
+`follow` or `move` at the commanded velocity, upward as far as an `obstacle`.
 `at` updates at these times, s, and `steps` in so many cycles. `=>` has what is expected:
 
     => position 0.5 nan ± 0.01       commands, one a joint: at each time, or after the last step;
