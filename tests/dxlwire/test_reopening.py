@@ -56,13 +56,14 @@ def returned(lines):
 
 
 def test_a_line_that_is_back_under_another_name_has_its_old_descriptor(adapters, kept):
-    before = list(kept.descriptors)
+    before, opened = list(kept.descriptors), len(os.listdir("/proc/self/fd"))
     adapters[1].unplug()
     assert kept.lost(1)
     assert kept.returned() == []
     adapters[1].plug_in()
     assert returned(kept) == [1]
     assert kept.descriptors == before
+    assert len(os.listdir("/proc/self/fd")) == opened
     os.write(kept.descriptors[1], b"right")
     assert adapters[1].heard() == b"right"
     os.write(kept.descriptors[0], b"left")

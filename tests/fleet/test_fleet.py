@@ -210,6 +210,12 @@ def test_what_is_wrong_with_a_file_is_one_sentence(
     assert sentence in said.errors[0]
 
 
+def test_a_quoted_argument_of_a_robot_keeps_its_space(tmp_path: Path) -> None:
+    file = tmp_path / "lab.yaml"
+    file.write_text("robots: {}\nagents: {a: {address: h:1, starts: {arm: arm.yaml 'logs:=my logs'}}}\n")
+    assert read_fleet(file).agents["a"].starts == {"arm": ("arm.yaml", "logs:=my logs")}
+
+
 def test_fleet_md_has_a_file_that_is_read_and_lines_that_can_be_typed(tmp_path: Path) -> None:
     page = page_text("fleet.md")
     (text,) = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)

@@ -178,6 +178,8 @@ def test_sliders_and_buttons_reach_the_servos(live: LiveRobot, serve: Serve, run
     assert rows["left_arm"]
     assert not rows["right_arm"]
     assert served.ask("/act", {"verb": "goal", "joint": JOINT, "position": 0.0})[0] == 409
+    status, answer = served.ask("/act", {"verb": "torque", "joints": ["all"], "on": False})
+    assert status == 200, answer
     assert served.ask("/act", {"verb": "halt"})[0] == 200
 
 
