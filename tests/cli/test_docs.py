@@ -51,6 +51,7 @@ TESTS = {
     ),
     "by-hand.md": ("tests/hand/test_terminal.py",),
     "from-lerobot-rustypot-sdk.md": (HERE,),
+    "import.md": ("tests/import/test_import.py",),
     "gallery.md": ("tests/cli/test_examples.py",),
     "logs.md": ("tests/analysis/season/test_logs.py", "tests/analysis/export/test_export.py"),
     "results.md": ("tests/lab/tracking/test_command.py",),

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from dxlrun.description.mistakes.foreign_files import ros_type
+from dxlrun.description.mistakes.ros_types import ros_type
 from dxlrun.description.motion import read_motion
 from dxlrun.description.reading import read_robot
 from dxlrun.errors import InputError
@@ -16,7 +16,7 @@ CALIBRATION = (
     '{"pan": {"id": 1, "drive_mode": 0, "homing_offset": -1196, "range_min": 725, "range_max": 3449}}'
 )
 FOREIGN = [
-    ("a.yaml", "robot: {type: omx_follower, port: /dev/ttyACM0}", "LeRobot; `dxlrun scan /dev/ttyACM0 --output"),
+    ("a.yaml", "robot: {type: omx_follower, port: /dev/ttyACM0}", "LeRobot; `dxlrun scan PORT --output"),
     ("a.yaml", "robot: {type: so101_follower, port: /dev/ttyACM0}", "LeRobot; use arms with Dynamixel servos"),
     ("a.yaml", "teleop: {type: koch_leader, port: x, id: y}", "LeRobot; `dxlrun examples koch`"),
     ("a.yaml", "type: koch_follower\nport: /dev/ttyACM0\ncameras: {}", "a configuration of LeRobot"),
@@ -25,10 +25,10 @@ FOREIGN = [
     ("a.yaml", "/**:\n  controller_manager:\n    ros__parameters: {update_rate: 100}", "file of ROS 2"),
     ("a.yaml", "arm_controller:\n  ros__parameters: {joints: [a], buses: 3}", "file of ROS 2"),
     ("a.yaml", "arm: {pan: {type: effort_controllers/JointPositionController, joint: pan}}", "file of ROS"),
-    ("a.json", '{"controllers": {"bus": {}}, "motorgroups": {}, "motors": {}}', "a configuration of pypot"),
-    ("a.urdf", '<?xml version="1.0"?>\n<robot name="x"/>', "a URDF: a body without servos"),
-    ("a.urdf", '<robot xmlns:xacro="http://ros.org/wiki/xacro" name="x"/>', "by `xacro a.urdf > a.urdf`"),
-    ("a.mtn", "type=motion\nversion=1.01\npage_begin\nname=march\n", "a motion file of RoboPlus"),
+    ("a.json", '{"controllers": {"bus": {}}, "motorgroups": {}, "motors": {}}', "a configuration of pypot; `dxlrun import a.json --output robot.yaml`"),
+    ("a.urdf", '<?xml version="1.0"?>\n<robot name="x"/>', "a URDF without servos"),
+    ("a.urdf", '<robot xmlns:xacro="http://ros.org/wiki/xacro" name="x"><xacro:arm/></robot>', "by `xacro a.urdf > a.urdf`"),
+    ("a.mtn", "type=motion\nversion=1.01\npage_begin\nname=march\n", "a motion file of RoboPlus; `dxlrun import a.mtn --output robot.yaml`"),
     ("a.yaml", "pan: {ID: 1, Return_Delay_Time: 0}\ntilt: {ID: 2}", "dynamixel_workbench"),
     ("a.py", "# pan and tilt\nimport numpy as np\n", "a program in Python"),
     ("a.bag", "#ROSBAG V2.0\nE\0\0\0", "a ROS 1 bag; `rosbags-convert --src a.bag --dst a --dst-storage mcap`"),

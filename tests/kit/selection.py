@@ -38,6 +38,7 @@ TESTED = {
     "foreign": ("dxlsim",),
     "foxglove": ("dxlrun_foxglove",),
     "hand": ("dxlrun_hand",),
+    "import": ("dxlrun_import",),
     "lab": ("dxlrun_lab",),
     "lights": ("lights",),
     "log": ("dxlrun.log", "dxlrun.messages"),

@@ -66,6 +66,7 @@ _PACKAGES = {
     "dxlrun_fleet": ("fleet", "keys"),
     "dxlrun_foxglove": ("foxglove",),
     "dxlrun_hand": ("setup", "calibrate", "teach"),
+    "dxlrun_import": ("import",),
     "dxlrun_lab": ("replay", "convert", "bench", "latency", "characterize", "experiment", "identify"),
     "dxlrun_teleop": ("teleop",),
     "dxlrun_view": ("view",),

@@ -21,7 +21,7 @@ from dxlrun.control.controllers.plugin_loading import Offer, PlugIns, interfaces
 from dxlrun.control.controllers.single_files import is_of_file
 from dxlrun.description.base_form import ParametersModel
 from dxlrun.description.document import KeyPath
-from dxlrun.description.mistakes.foreign_files import ros_type
+from dxlrun.description.mistakes.ros_types import ros_type
 from dxlrun.description.robot import ControllerEntry
 from dxlrun.errors import suggestion
 from dxlrun.plan.loop_plan import ControllerPlan, JointPlan

@@ -30,7 +30,7 @@ from dxlrun.control.controllers.update_order import below, rate_divider, rate_fi
 from dxlrun.description.base_form import ParametersModel, PlugInEntry
 from dxlrun.description.document import KeyPath, read_file
 from dxlrun.description.form_problems import errors_between_keys, problems_of
-from dxlrun.description.mistakes.foreign_files import ros_type
+from dxlrun.description.mistakes.ros_types import ros_type
 from dxlrun.description.reading import Description
 from dxlrun.errors import Mark
 from dxlrun.plan.loop_plan import ControllerPlan

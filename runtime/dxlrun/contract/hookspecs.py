@@ -26,6 +26,7 @@ from dxlrun.installed_plugins import GROUP
 if TYPE_CHECKING:  # the verbs of a package need neither numpy nor pydantic
     from dxlrun import Sensor
     from dxlrun.contract.controller import Controller
+    from dxlrun.description.other_files import FileFormat
     from dxlrun.features.feature import Feature
 
 CONTRACT_VERSION = 4
@@ -78,6 +79,22 @@ class HookSpecs:
         `Feature("lights", "my_package.lights")` adds the section `lights`, whose files are in that package;
         see `dxlrun.tooling.features`. The hook must be fast to import: each stage imports the file that it
         needs.
+        """
+
+    @hookspec
+    def dxlrun_formats(self) -> Sequence[FileFormat]:  # type: ignore[empty-body]  # a signature
+        """Return formats of other programs' files, for `dxlrun import` and for the refusals of all commands.
+
+        The hook is called when a file was refused, or is imported. A format without a converter names a file
+        and the next step:
+
+            from dxlrun import hookimpl
+            from dxlrun.tooling.files import FileFormat
+
+            @hookimpl
+            def dxlrun_formats() -> list[FileFormat]:
+                is_bvh = lambda content: content.data.startswith(b"HIERARCHY")
+                return [FileFormat("a motion capture", is_bvh, "retarget it, and import its joints as CSV")]
         """
 
     @hookspec

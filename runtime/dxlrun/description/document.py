@@ -22,7 +22,6 @@ import msgspec
 import yaml
 from yaml.reader import Reader
 
-from dxlrun.description.mistakes.foreign_files import kind_of_bytes, kind_of_text
 from dxlrun.description.mistakes.syntax import explain_syntax
 from dxlrun.errors import InputError, Mark, Problem
 
@@ -99,15 +98,20 @@ def read_file(path: Path) -> bytes:
     Raises:
         OSError: The file cannot be read, is too large or is not a regular file; `strerror` is the reason.
     """
+    # One byte more shows that a file is too large, without reading the rest.
+    data = read_start(path, LARGEST_FILE + 1)
+    if len(data) > LARGEST_FILE:
+        raise OSError(errno.EFBIG, f"the file is larger than {LARGEST_FILE // 1024} KiB", str(path))
+    return data
+
+
+def read_start(path: Path, most: int) -> bytes:
+    """Return the first bytes of a regular file, at most `most`. Raises OSError as `read_file`."""
     folder = _folder.get()
     if folder is not None and not path.resolve().is_relative_to(folder):
         raise PermissionError(errno.EACCES, "it is outside the permitted folder", str(path))
     with open(path, "rb", opener=_opened) as stream:
-        # One byte more shows that a file is too large, without reading the rest.
-        data = stream.read(LARGEST_FILE + 1)
-    if len(data) > LARGEST_FILE:
-        raise OSError(errno.EFBIG, f"the file is larger than {LARGEST_FILE // 1024} KiB", str(path))
-    return data
+        return stream.read(most)
 
 
 def _opened(name: str, flags: int) -> int:
@@ -137,7 +141,7 @@ def read_text(path: Path, language: str = "YAML") -> str:
 
     Args:
         path: The file.
-        language: Name of the format in messages; for `YAML`, files of other programs are refused.
+        language: Name of the format in messages.
 
     Raises:
         InputError: The file is missing, too large or not UTF-8.
@@ -158,12 +162,7 @@ def read_text(path: Path, language: str = "YAML") -> str:
             raise refusal(Mark(file), reason, "split it, or shorten it") from None
         what, fix = f"the file cannot be read ({reason})", "check its name and permissions"
         raise refusal(Mark(file), what, fix) from None
-    if language == "YAML" and (kind := kind_of_bytes(data, path)):
-        raise refusal(Mark(file), *kind)
-    text = _decoded(data, file, language)
-    if language == "YAML" and (kind := kind_of_text(text, path)):
-        raise refusal(Mark(file), *kind)
-    return text
+    return _decoded(data, file, language)
 
 
 def _decoded(data: bytes, file: str, language: str) -> str:

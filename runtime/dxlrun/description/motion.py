@@ -14,7 +14,7 @@ from dxlrun.description.base_form import Form, Name, key, validation_error
 from dxlrun.description.document import Marks, grow, parse, read_text, refusal
 from dxlrun.description.form_problems import read_form
 from dxlrun.description.joints.groups import NO_GROUPS, Groups, put_in
-from dxlrun.description.mistakes.foreign_files import kind_of_data
+from dxlrun.description.other_files import foreign_named
 from dxlrun.description.units import Acceleration, Duration, Measure, Position, Speed
 
 
@@ -154,16 +154,21 @@ class MotionDescription(msgspec.Struct, frozen=True):
 
 def read_motion(path: Path, groups: Groups = NO_GROUPS) -> MotionDescription:
     """Read a motion file, replace its group names by joints; raise InputError with all mistakes."""
-    return parse_motion(read_text(path), path, groups)
+    with foreign_named(path):
+        text = read_text(path)
+    return parse_motion(text, path, groups)
 
 
 def parse_motion(text: str, path: Path, groups: Groups = NO_GROUPS) -> MotionDescription:
     """Parse the text of a motion file; `path` is for messages. Raises InputError with all mistakes."""
+    with foreign_named(path, text):
+        return _parsed_motion(text, path, groups)
+
+
+def _parsed_motion(text: str, path: Path, groups: Groups) -> MotionDescription:
     file = str(path)
     grown = put_in(grow(parse(text, file), file, refuse_arguments), groups)
     if "motions" not in grown.data and {"buses", "joints"} & grown.data.keys():
         fix = f"run it with `dxlrun {path}`, and give --play a motion file"
         raise refusal(grown.marks.value(), "this is a robot file, not a motion", fix)
-    if "motions" not in grown.data and (kind := kind_of_data(grown.data, path)):
-        raise refusal(grown.marks.value(), *kind)
     return MotionDescription(read_form(grown, MotionForm), grown.marks, path, text)

@@ -14,8 +14,8 @@ from dxlrun.description.form_problems import path_text, read_form
 from dxlrun.description.including import KEY, Source, merged, read_sources
 from dxlrun.description.joints.groups import with_groups
 from dxlrun.description.joints.joint_forms import misfits
-from dxlrun.description.mistakes.foreign_files import kind_of_data
 from dxlrun.description.mistakes.words import misplaced_sections
+from dxlrun.description.other_files import foreign_named
 from dxlrun.description.robot import Robot, robot_form
 from dxlrun.errors import InputError, Problem, told_once
 
@@ -51,6 +51,11 @@ def read_robot(
     Raises:
         InputError: The file or a fragment cannot be read or is not YAML; otherwise all problems of its form.
     """
+    with foreign_named(path):
+        return _read_robot(path, arguments, replacements)
+
+
+def _read_robot(path: Path, arguments: Mapping[str, str], replacements: Sequence[Replacement]) -> Description:
     sources = read_sources(path)
     _refuse_other_files(sources[-1])
     # Without arguments first, to learn which arguments are declared.
@@ -84,10 +89,8 @@ _OTHER_FILES = {
 
 
 def _refuse_other_files(source: Source) -> None:
-    """Raise InputError if a file given as a robot file is a motion file, motor file or of another program."""
+    """Raise InputError if a file given as a robot file is a motion file or a motor file."""
     data, marks = source.declared.data, source.declared.marks
-    if kind := kind_of_data(data, source.path):
-        raise refusal(marks.value(), *kind)
     if data.keys() & {"buses", "joints", "controllers", KEY}:
         return
     for key, (called, fix) in _OTHER_FILES.items():

@@ -1,4 +1,4 @@
-"""Files: forms of a package's own YAML files and of its section of the robot file.
+"""Files: forms of a package's own YAML files and of its section of the robot file; formats of other programs.
 
 A model defines the keys. All mistakes in a file are reported at once, each with its place.
 
@@ -25,10 +25,17 @@ if TYPE_CHECKING:
     from dxlrun.description.base_form import key as key
     from dxlrun.description.base_form import validation_error as validation_error
     from dxlrun.description.document import KeyPath as KeyPath
+    from dxlrun.description.mistakes.ros_types import ros_type as ros_type
+    from dxlrun.description.other_files import Conversion as Conversion
+    from dxlrun.description.other_files import FileContent as FileContent
+    from dxlrun.description.other_files import FileFormat as FileFormat
+    from dxlrun.description.other_files import ImportOptions as ImportOptions
+    from dxlrun.description.other_files import format_of as format_of
+    from dxlrun.description.other_files import read_content as read_content
+    from dxlrun.description.other_files import read_yaml as read_yaml
     from dxlrun.description.units import Acceleration as Acceleration
     from dxlrun.description.units import Position as Position
     from dxlrun.description.units import Speed as Speed
-    from dxlrun.description.yaml_file import read_yaml as read_yaml
     from dxlrun.errors import Mark as Mark
     from dxlrun.errors import Problem as Problem
     from dxlrun.errors import suggestion as suggestion

@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO
 
-from dxlrun.description.mistakes.foreign_files import LONGEST_MAGIC, kind_of_bytes
 from dxlrun.errors import LogError
 from dxlrun.log.log_file import has_writer
 from dxlrun.log.parts import log_files, missing_parts
@@ -119,10 +118,13 @@ def _opened(path: Path) -> Iterator[tuple[IO[bytes], int]]:
             size = os.fstat(stream.fileno()).st_size
             if size == 0:
                 raise LogError(f"{path}: the file is empty: the recorder wrote nothing")
-            start = stream.read(LONGEST_MAGIC)
+            start = stream.read(len(MAGIC))
             if not start.startswith(MAGIC):
-                if kind := kind_of_bytes(start, path):
-                    raise LogError(f"{path}: {'; '.join(kind)}")
+                # Imported here because a log needs no forms.
+                from dxlrun.description.other_files import foreign_sentence
+
+                if foreign := foreign_sentence(path):
+                    raise LogError(f"{path}: {'; '.join(foreign)}")
                 raise LogError(f"{path}: this is not an MCAP file; give a log of dxlrun")
             yield stream, size
     except OSError as error:

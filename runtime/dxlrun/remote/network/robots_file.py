@@ -8,7 +8,7 @@ from typing import Annotated
 from pydantic import AfterValidator
 
 from dxlrun.description.base_form import Form, key, validation_error
-from dxlrun.description.yaml_file import read_yaml
+from dxlrun.description.other_files import read_yaml
 from dxlrun.errors import InputError
 from dxlrun.remote.sockets import Address
 

@@ -1,0 +1,159 @@
+"""RoboPlus Motion: pages of a `.mtn` file, as a robot with a `keyframe_player` that has them.
+
+Source: ROBOTIS' e-Manual ("RoboPlus Motion"), and arrays that users made of such files. `play_param` has next
+page, exit page, repetitions, speed and inertial force. A step has a position for each entry of `enable` (the
+first is not used), the pause and the time, s. Pages count from 1. Bit 14 marks a joint that a step does not
+move [i: as in ROBOTIS' binary pages].
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+
+from dxlrun.tooling.files import Conversion, FileContent, FileFormat, ImportOptions, Mark
+from dxlrun_import.checked_values import refused, valid_name
+from dxlrun_import.robot_draft import DraftBus, JointDraft, RobotDraft, wrapped
+
+MIDDLE, STEP_DEG = 512, 300 / 1023  # of an AX-12
+SPEED_DEG = 300.0
+"""Mean speed of the fastest way, deg/s: the peak of a cubic is 1.5 times as high, and an AX-12 reaches 472"""
+SHORTEST_S = 0.01  # of a step of a keyframe_player
+_UNMOVED = 0x4000
+_USUAL_COMPLIANCE, _USUAL_INERTIA = 5, 32
+_BY_HAND = "write its motions by hand; docs/how-to/import.md"
+
+
+@dataclass
+class MotionPage:
+    """MotionPage of a motion file."""
+
+    mark: Mark
+    number: int
+    title: str = ""
+    compliance: Sequence[float] = ()
+    param: Sequence[float] = (0, 0, 1, 1, 32)
+    steps: list[list[float]] = field(default_factory=list)
+    name: str = ""
+    """Name of its motion"""
+    follower: MotionPage | None = None
+
+
+def convert(content: FileContent, options: ImportOptions) -> Conversion:
+    """Convert the pages to motions of a `keyframe_player`, for joints that are named after their IDs."""
+    flags, pages = _read(content)
+    draft = RobotDraft(content, FORMAT.name, options.name)
+    draft.buses["main"] = DraftBus(1.0, 1_000_000, comment="guessed: protocol and baud_rate of a Bioloid")
+    used = [page for page in pages if page.steps]
+    ids = [number for number, flag in enumerate(flags) if flag and number]
+    for number in ids if used else ():
+        for page in used:
+            if any(1023 < step[number] < _UNMOVED for step in page.steps):
+                what = f"a position of ID {number} is above 1023, so it is not an AX servo"
+                raise refused(page.mark, what, _BY_HAND)
+        comment = "guessed: name, model, direction"
+        draft.add_joint(JointDraft(f"joint_{number}", number, content.mark(), "AX-12A", comment=comment))
+    for page in used:
+        name = valid_name(page.title) if page.title else f"page_{page.number}"
+        page.name = f"{name}_{page.number}" if any(name == one.name for one in used) else name
+    for page in used:
+        _link(page, pages, draft)
+    lines = ["  pages:", "    type: keyframe_player"]
+    lines += [*wrapped("    joints: [", [*draft.joints], "]"), "    motions:"]
+    for page in used:
+        before = [one for one in used if one.follower is page or (one is page and page.param[2] > 1)]
+        lines += _motion(page, ids, [one.steps[-1] for one in before], draft)
+    draft.controllers = lines
+    return draft.conversion()
+
+
+def _link(page: MotionPage, pages: Sequence[MotionPage], draft: RobotDraft) -> None:
+    """Set the follower of a page, unless it closes a circle, which a `keyframe_player` refuses."""
+    number = int(page.param[0])
+    follower = pages[number - 1] if 0 < number <= len(pages) and pages[number - 1].steps else None
+    way = follower
+    while way is not None and way is not page:
+        way = way.follower
+    if way is None:
+        page.follower = follower
+    else:
+        said = f"it repeats by its next page {number} until a stop; here it ends"
+        draft.remarks.append(f"page {page.name}: {said}")
+
+
+def _motion(
+    page: MotionPage, ids: Sequence[int], starts: list[list[float]], draft: RobotDraft
+) -> Iterator[str]:
+    """Yield the lines of a page; `starts` are the poses from which it is reached."""
+    _, leaves, repeat, speed, inertia = page.param
+    if speed <= 0:
+        raise refused(page.mark, f"page {page.name} has speed {speed:g}", "give it a speed above 0")
+    unusual = any(page.compliance[one] != _USUAL_COMPLIANCE for one in ids if one < len(page.compliance))
+    remarks = [f"its exit page {int(leaves)}; a motion ends after its last step"] * bool(leaves)
+    remarks += [f"compliance other than {_USUAL_COMPLIANCE}; write registers of the joints"] * unusual
+    remarks += [f"inertial force {inertia:g}; ways between poses are cubics"] * (inertia != _USUAL_INERTIA)
+    yield f"      {page.name}:"
+    yield from [f"        speed: {speed:g}"] * (speed != 1)
+    yield from [f"        repeat: {int(repeat)}"] * (repeat > 1)
+    if page.follower is not None:
+        yield f"        next: {page.follower.name}"
+    yield "        steps:"
+    for index, step in enumerate(page.steps, 1):
+        moved = [one for one in ids if step[one] < _UNMOVED]
+        pose = [f"joint_{one}: {round((step[one] - MIDDLE) * STEP_DEG, 2) + 0.0:g} deg" for one in moved]
+        ways = [abs(step[one] - start[one]) for start in starts for one in moved if start[one] < _UNMOVED]
+        least = max(SHORTEST_S, math.ceil(max(ways, default=0) * STEP_DEG * speed / SPEED_DEG * 1000) / 1000)
+        if step[-1] < least:
+            remarks.append(f"step {index} takes {least:g} s instead of {step[-1]:g} s, as fast as AX servos")
+        time = max(step[-1], least)
+        yield from wrapped(f"          - {{time: {time:g} s, pause: {step[-2]:g} s, pose: {{", pose, "}}")
+        starts = [step]
+    draft.remarks += [f"page {page.name}: {remark}" for remark in remarks]
+
+
+def _read(content: FileContent) -> tuple[list[float], list[MotionPage]]:
+    """Return the flags of the IDs in use, and the pages. Raises InputError with the line."""
+    flags: list[float] = []
+    pages: list[MotionPage] = []
+    is_open = False
+    for number, line in enumerate(content.text.splitlines(), 1):
+        mark = Mark(str(content.path), number, 1)
+        key, _, value = line.strip().partition("=")
+        if key in ("page_begin", "page_end"):
+            is_open = key == "page_begin"
+            pages += [MotionPage(mark, len(pages) + 1)] * is_open
+        elif key == "enable":
+            flags = _numbers(value, mark)
+        elif key == "motor_type" and any(_numbers(value, mark)):
+            raise refused(mark, "it has servos other than AX", _BY_HAND)
+        elif key == "name" and pages:
+            pages[-1].title = value
+        elif key == "step" and pages:
+            pages[-1].steps.append(_numbers(value, mark, len(flags) + 2))
+        elif key in ("compliance", "play_param") and pages:
+            count = 5 if key == "play_param" else None
+            setattr(pages[-1], key.removeprefix("play_"), _numbers(value, mark, count))
+    if is_open:
+        raise refused(pages[-1].mark, "this page has no page_end: the file is cut off", "export it again")
+    return flags, pages
+
+
+def _numbers(text: str, mark: Mark, count: int | None = None) -> list[float]:
+    try:
+        found = [float(word) for word in text.split()]
+    except ValueError:
+        found = [math.nan]
+    if not all(map(math.isfinite, found)):
+        raise refused(mark, f"{text:.40} is not a list of numbers", "export the file again")
+    if count not in (None, len(found)):
+        what = f"this line has {len(found)} numbers, but must have {count}"
+        raise refused(mark, what, "export the file again")
+    return found
+
+
+def _matches(content: FileContent) -> bool:
+    return content.text.startswith("type=motion") or "\npage_begin\n" in content.text.replace("\r", "")
+
+
+FORMAT = FileFormat("a motion file of RoboPlus", _matches, convert=f"{__name__}:convert")

@@ -1,0 +1,115 @@
+"""`dxlrun import FILE`: makes a robot file or a motion file of another program's file."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+
+from dxlrun import InputError
+from dxlrun.tooling.output import check_target, print_warning, show_json, show_parts, write_target
+from dxlrun.tooling.verbs import DebugFlag, JsonFlag
+
+if TYPE_CHECKING:
+    from dxlrun.tooling.files import Conversion, FileContent, FileFormat, ImportOptions
+
+PAGE = "docs/how-to/import.md"
+_YAML = (".yaml", ".yml")
+
+
+def import_file(
+    file: Annotated[Path, Parameter(name="file")],
+    /,
+    *,
+    output: Path | None = None,
+    as_json: JsonFlag = False,
+    debug: DebugFlag = False,
+) -> int:
+    """Make a robot file or a motion file of another program's file.
+
+    The format is recognized by the content. Facts that the new file does not have are listed, with the
+    reason. An existing file is not overwritten. Nothing in the file is executed.
+
+    Parameters
+    ----------
+    file
+        File of another program, such as a configuration of pypot or a motion of RoboPlus.
+    output
+        Output file: the new robot file or motion file. Default: print its text.
+    """
+    if output is not None:
+        if output.suffix not in _YAML:
+            raise InputError(f"{output} does not end in .yaml; give the name of a YAML file")
+        check_target(output)
+    from dxlrun.tooling.files import ImportOptions, read_content
+    from dxlrun_import.checked_values import valid_name
+
+    try:
+        content = read_content(file)
+    except OSError as error:
+        raise InputError(f"{file}: cannot be read ({error.strerror or error}); check the path") from None
+    found = recognized(content)
+    options = ImportOptions(valid_name((output or file).stem), folder=(output or file).parent)
+    conversion = converted(content, found, options)
+    if output is not None:
+        write_target(output, conversion.text)
+    if as_json:
+        result = {
+            "format": found.name,
+            "makes": found.makes,
+            "output": None if output is None else str(output),
+            "text": conversion.text,
+        }
+        show_json(result, warnings=[f"{file}: not taken over: {remark}" for remark in conversion.remarks])
+        return 0
+    if output is None:
+        show_parts(conversion.text.rstrip("\n"))
+    else:
+        show_parts(f"{output}: a {found.makes} file, made of {found.name}")
+    for remark in conversion.remarks:
+        print_warning(f"{file}: not taken over: {remark}")
+    if output is not None:
+        check = (
+            f"dxlrun check {output}" if found.makes == "robot" else f"dxlrun check ROBOT.yaml --play {output}"
+        )
+        show_parts(f"next: {check}")
+    return 0
+
+
+def recognized(content: FileContent) -> FileFormat:
+    """Return the format of a file that can be converted. Raises InputError for any other file."""
+    from dxlrun.tooling.files import format_of
+
+    found = format_of(content)
+    if found is not None and found.convert:
+        return found
+    if found is not None:
+        raise content.refusal(*found.sentence(content.path))
+    if content.text.lstrip()[:1] == "<":
+        _ = content.xml  # raises InputError with the place of the first mistake
+    if content.text.strip() and _has_structure(content.text):
+        _ = content.document
+    raise content.refusal(
+        "the format of this file is not known", f"give a file of one of the formats in {PAGE}"
+    )
+
+
+def _has_structure(text: str) -> bool:
+    return text.lstrip()[:1] in "{[" or ": " in text or ":\n" in text
+
+
+def converted(content: FileContent, found: FileFormat, options: ImportOptions) -> Conversion:
+    """Convert a file, and check the result like any robot file or motion file. Raises InputError."""
+    from dxlrun.tooling.robots import compile_texts, parse_motion
+
+    if content.values and content.document.problems:
+        raise InputError(content.document.problems)
+    module, _, name = found.convert.partition(":")
+    conversion: Conversion = getattr(import_module(module), name)(content, options)
+    if found.makes == "motion":
+        parse_motion(conversion.text, Path("motion.yaml"))
+    else:
+        compile_texts({"robot.yaml": conversion.text}, {}, conversion.urdf)
+    return conversion
