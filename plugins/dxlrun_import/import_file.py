@@ -24,6 +24,8 @@ def import_file(
     /,
     *,
     output: Path | None = None,
+    controller: str = "",
+    unit: str = "",
     as_json: JsonFlag = False,
     debug: DebugFlag = False,
 ) -> int:
@@ -38,7 +40,13 @@ def import_file(
         File of another program, such as a configuration of pypot or a motion of RoboPlus.
     output
         Output file: the new robot file or motion file. Default: print its text.
+    controller
+        Controller that plays the motion, such as arm. Default: arm, as in imported robot files.
+    unit
+        Unit of positions in files without units, rad or deg. Default: rad.
     """
+    if unit not in ("", "rad", "deg"):
+        raise InputError(f"--unit {unit}: this unit is not known; give rad or deg")
     if output is not None:
         if output.suffix not in _YAML:
             raise InputError(f"{output} does not end in .yaml; give the name of a YAML file")
@@ -51,7 +59,9 @@ def import_file(
     except OSError as error:
         raise InputError(f"{file}: cannot be read ({error.strerror or error}); check the path") from None
     found = recognized(content)
-    options = ImportOptions(valid_name((output or file).stem), folder=(output or file).parent)
+    options = ImportOptions(
+        valid_name((output or file).stem), controller=controller, unit=unit, folder=(output or file).parent
+    )
     conversion = converted(content, found, options)
     if output is not None:
         write_target(output, conversion.text)
