@@ -24,6 +24,8 @@ def import_file(
     /,
     *,
     output: Path | None = None,
+    type_name: Annotated[str, Parameter(name="--type")] = "",
+    modes: Path | None = None,
     controller: str = "",
     unit: str = "",
     as_json: JsonFlag = False,
@@ -40,6 +42,10 @@ def import_file(
         File of another program, such as a configuration of pypot or a motion of RoboPlus.
     output
         Output file: the new robot file or motion file. Default: print its text.
+    type_name
+        Type of the arm, for a calibration of LeRobot: koch_follower, for example.
+    modes
+        File with the modes of the servos, for a motor configuration of Interbotix.
     controller
         Controller that plays the motion, such as arm. Default: arm, as in imported robot files.
     unit
@@ -51,16 +57,18 @@ def import_file(
         if output.suffix not in _YAML:
             raise InputError(f"{output} does not end in .yaml; give the name of a YAML file")
         check_target(output)
-    from dxlrun.tooling.files import ImportOptions, read_content
+    from dxlrun.tooling.files import ImportOptions
     from dxlrun_import.checked_values import valid_name
 
-    try:
-        content = read_content(file)
-    except OSError as error:
-        raise InputError(f"{file}: cannot be read ({error.strerror or error}); check the path") from None
+    content = opened(file)
     found = recognized(content)
     options = ImportOptions(
-        valid_name((output or file).stem), controller=controller, unit=unit, folder=(output or file).parent
+        valid_name((output or file).stem),
+        type=type_name,
+        controller=controller,
+        unit=unit,
+        modes=None if modes is None else opened(modes),
+        folder=(output or file).parent,
     )
     conversion = converted(content, found, options)
     if output is not None:
@@ -86,6 +94,16 @@ def import_file(
         )
         show_parts(f"next: {check}")
     return 0
+
+
+def opened(file: Path) -> FileContent:
+    """Read a file of another program. Raises InputError if it cannot be read."""
+    from dxlrun.tooling.files import read_content
+
+    try:
+        return read_content(file)
+    except OSError as error:
+        raise InputError(f"{file}: cannot be read ({error.strerror or error}); check the path") from None
 
 
 def recognized(content: FileContent) -> FileFormat:

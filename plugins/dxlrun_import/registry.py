@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from dxlrun_import.formats import (
     csv_positions,
+    interbotix,
     keyframes,
+    lerobot,
     pypot,
     pypot_move,
     roboplus,
+    robotis_robot,
     ros2_control,
     signatures,
     trajectory,
+    workbench,
 )
 
 FORMATS = (
@@ -18,6 +22,11 @@ FORMATS = (
     pypot.FORMAT,
     roboplus.FORMAT,
     ros2_control.FORMAT,
+    lerobot.FORMAT,
+    interbotix.FORMAT,
+    robotis_robot.FORMAT,
+    workbench.FORMAT,
+    workbench.INIT,
     trajectory.FORMAT,
     keyframes.FORMAT,
     pypot_move.FORMAT,

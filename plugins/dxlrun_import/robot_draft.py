@@ -185,10 +185,12 @@ class RobotDraft:
             lines += ["", "groups:"]
             for name, joints in self.groups.items():
                 lines += wrapped(f"  {name}: {{joints: [", joints, "]}")
+        limp = any(joint.limp for joint in self.joints.values())
         lines += ["", "controllers:", "  joint_state_broadcaster: {type: joint_state_broadcaster}"]
         lines += self.controllers or [
             "  arm:  # guessed: one trajectory for all joints",
             "    type: joint_trajectory_controller",
+            *["    active: false  # some of its joints are limp at the start"] * limp,
             *wrapped("    joints: [", list(self.joints), "]"),
         ]
         if self.urdf:

@@ -20,7 +20,7 @@ FOREIGN = [
     ("a.yaml", "robot: {type: so101_follower, port: /dev/ttyACM0}", "LeRobot; use arms with Dynamixel servos"),
     ("a.yaml", "teleop: {type: koch_leader, port: x, id: y}", "LeRobot; `dxlrun examples koch`"),
     ("a.yaml", "type: koch_follower\nport: /dev/ttyACM0\ncameras: {}", "a configuration of LeRobot"),
-    ("a.json", CALIBRATION, "a calibration of LeRobot"),
+    ("a.json", CALIBRATION, "a calibration of LeRobot; `dxlrun import a.json --type"),
     ("a.json", '{"homing_offset": [1], "drive_mode": [0], "motor_names": ["a"]}', "a calibration of LeRobot"),
     ("a.yaml", "/**:\n  controller_manager:\n    ros__parameters: {update_rate: 100}", "file of ROS 2"),
     ("a.yaml", "arm_controller:\n  ros__parameters: {joints: [a], buses: 3}", "file of ROS 2"),

@@ -17,11 +17,10 @@ from dxlrun_import.checked_values import refused, valid_name
 from dxlrun_import.robot_draft import DraftBus, JointDraft, RobotDraft, wrapped
 
 MIDDLE, STEP_DEG = 512, 300 / 1023  # of an AX-12
-SPEED_DEG = 300.0
-"""Mean speed of the fastest way, deg/s: the peak of a cubic is 1.5 times as high, and an AX-12 reaches 472"""
+SPEED_DEG = 300.0  # mean speed: the peak of a cubic is 1.5 times as high, and an AX-12 reaches 472 deg/s
 SHORTEST_S = 0.01  # of a step of a keyframe_player
 _UNMOVED = 0x4000
-_USUAL_COMPLIANCE, _USUAL_INERTIA = 5, 32
+_USUAL_COMPLIANCE = 5
 _BY_HAND = "write its motions by hand; docs/how-to/import.md"
 
 
@@ -36,7 +35,6 @@ class MotionPage:
     param: Sequence[float] = (0, 0, 1, 1, 32)
     steps: list[list[float]] = field(default_factory=list)
     name: str = ""
-    """Name of its motion"""
     follower: MotionPage | None = None
 
 
@@ -52,8 +50,8 @@ def convert(content: FileContent, options: ImportOptions) -> Conversion:
             if any(1023 < step[number] < _UNMOVED for step in page.steps):
                 what = f"a position of ID {number} is above 1023, so it is not an AX servo"
                 raise refused(page.mark, what, _BY_HAND)
-        comment = "guessed: name, model, direction"
-        draft.add_joint(JointDraft(f"joint_{number}", number, content.mark(), "AX-12A", comment=comment))
+        joint = JointDraft(f"joint_{number}", number, content.mark(), "AX-12A")
+        draft.add_joint(joint._replace(comment="guessed: name, model, direction"))
     for page in used:
         name = valid_name(page.title) if page.title else f"page_{page.number}"
         page.name = f"{name}_{page.number}" if any(name == one.name for one in used) else name
@@ -77,27 +75,25 @@ def _link(page: MotionPage, pages: Sequence[MotionPage], draft: RobotDraft) -> N
         way = way.follower
     if way is None:
         page.follower = follower
-    else:
-        said = f"it repeats by its next page {number} until a stop; here it ends"
-        draft.remarks.append(f"page {page.name}: {said}")
+        return
+    remark = f"it repeats by its next page {number} until a stop; here it ends"
+    draft.remarks.append(f"page {page.name}: {remark}")
 
 
 def _motion(
     page: MotionPage, ids: Sequence[int], starts: list[list[float]], draft: RobotDraft
 ) -> Iterator[str]:
     """Yield the lines of a page; `starts` are the poses from which it is reached."""
-    _, leaves, repeat, speed, inertia = page.param
+    _, leaves, repeat, speed, _ = page.param
     if speed <= 0:
         raise refused(page.mark, f"page {page.name} has speed {speed:g}", "give it a speed above 0")
     unusual = any(page.compliance[one] != _USUAL_COMPLIANCE for one in ids if one < len(page.compliance))
     remarks = [f"its exit page {int(leaves)}; a motion ends after its last step"] * bool(leaves)
     remarks += [f"compliance other than {_USUAL_COMPLIANCE}; write registers of the joints"] * unusual
-    remarks += [f"inertial force {inertia:g}; ways between poses are cubics"] * (inertia != _USUAL_INERTIA)
     yield f"      {page.name}:"
     yield from [f"        speed: {speed:g}"] * (speed != 1)
     yield from [f"        repeat: {int(repeat)}"] * (repeat > 1)
-    if page.follower is not None:
-        yield f"        next: {page.follower.name}"
+    yield from [f"        next: {one.name}" for one in (page.follower,) if one]
     yield "        steps:"
     for index, step in enumerate(page.steps, 1):
         moved = [one for one in ids if step[one] < _UNMOVED]
@@ -106,8 +102,8 @@ def _motion(
         least = max(SHORTEST_S, math.ceil(max(ways, default=0) * STEP_DEG * speed / SPEED_DEG * 1000) / 1000)
         if step[-1] < least:
             remarks.append(f"step {index} takes {least:g} s instead of {step[-1]:g} s, as fast as AX servos")
-        time = max(step[-1], least)
-        yield from wrapped(f"          - {{time: {time:g} s, pause: {step[-2]:g} s, pose: {{", pose, "}}")
+        start = f"          - {{time: {max(step[-1], least):g} s, pause: {step[-2]:g} s, pose: {{"
+        yield from wrapped(start, pose, "}}")
         starts = [step]
     draft.remarks += [f"page {page.name}: {remark}" for remark in remarks]
 
@@ -147,8 +143,7 @@ def _numbers(text: str, mark: Mark, count: int | None = None) -> list[float]:
     if not all(map(math.isfinite, found)):
         raise refused(mark, f"{text:.40} is not a list of numbers", "export the file again")
     if count not in (None, len(found)):
-        what = f"this line has {len(found)} numbers, but must have {count}"
-        raise refused(mark, what, "export the file again")
+        raise refused(mark, f"{len(found)} numbers are here, but must be {count}", "export the file again")
     return found
 
 

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
 _GAINS = {"Position P Gain", "Position I Gain", "Position D Gain"}
 _SILENT = {"ID", "id", "type", "Operating Mode", "Return Delay Time", *_GAINS}
-_HARDWARE = {"port_name", "usb_port", "baud_rate", "number_of_joints", "number_of_transmissions"}
 _REVERSED = 1  # bit of Drive Mode
 _MIDDLE_TICKS, _TICK_DEG = 2048, 360 / 4096
 
@@ -47,9 +46,6 @@ def convert(content: FileContent, options: ImportOptions) -> Conversion:
                 draft.add_joint(_joint(content, joint, servo, factor, draft)._replace(bus=bus))
                 for name in _params(servo).keys() - _SILENT:
                     unused.setdefault(name, []).append(str(joint.get("name")))
-        for name in sorted(hardware.keys() - _HARDWARE):
-            if "_name" not in name and "_to_" not in name:
-                draft.remarks.append(f"parameter {name}: has no equivalent")
         for gpio in block.iter("gpio"):
             if _params(gpio).get("type", "dxl") != "dxl":
                 draft.remarks.append(f"gpio {gpio.get('name')}: write it as a device; docs/how-to/devices.md")

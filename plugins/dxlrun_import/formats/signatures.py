@@ -76,18 +76,7 @@ def _has_key(value: object, key: str, levels: int) -> bool:
 
 
 def _is_calibration(content: FileContent) -> bool:
-    data = content.values
-    return _is_calibrated(data) or (bool(data) and all(map(_is_calibrated, data.values())))
-
-
-def _is_calibrated(value: object) -> bool:
-    keys = value if isinstance(value, dict) else {}
-    return "homing_offset" in keys and not {"range_min", "drive_mode"}.isdisjoint(keys)
-
-
-def _is_workbench(content: FileContent) -> bool:
-    data = content.values
-    return bool(data) and all(isinstance(value, dict) and "ID" in value for value in data.values())
+    return {"homing_offset", "drive_mode", "motor_names"} <= content.values.keys()
 
 
 def _is_ros_one(content: FileContent) -> bool:
@@ -178,11 +167,10 @@ LAST = (
         f"{_DRAFT}; docs/how-to/ros2.md explains how dxlrun and ROS 2 work together",
     ),
     FileFormat(
-        "a calibration of LeRobot",
+        "a calibration of LeRobot, of its first version",
         _is_calibration,
-        f"{_DRAFT}, and `dxlrun calibrate robot.yaml` measures its joints",
+        "calibrate the arm with a newer LeRobot, or by `dxlrun calibrate robot.yaml`",
     ),
-    FileFormat("a configuration of ROBOTIS' dynamixel_workbench", _is_workbench, _DRAFT),
     FileFormat(
         "a parameter file of ROS",
         _is_ros_one,
