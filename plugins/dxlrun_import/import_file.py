@@ -16,6 +16,11 @@ if TYPE_CHECKING:
     from dxlrun.tooling.files import Conversion, FileContent, FileFormat, ImportOptions
 
 PAGE = "docs/how-to/import.md"
+_NEXT = {
+    "robot": "dxlrun check {output}",
+    "motion": "dxlrun check ROBOT.yaml --play {output}",
+    "fragment": "write `include: [{output}]` in a robot file",
+}
 _YAML = (".yaml", ".yml")
 
 
@@ -89,10 +94,7 @@ def import_file(
     for remark in conversion.remarks:
         print_warning(f"{file}: not taken over: {remark}")
     if output is not None:
-        check = (
-            f"dxlrun check {output}" if found.makes == "robot" else f"dxlrun check ROBOT.yaml --play {output}"
-        )
-        show_parts(f"next: {check}")
+        show_parts(f"next: {_NEXT[found.makes].format(output=output)}")
     return 0
 
 
@@ -138,6 +140,6 @@ def converted(content: FileContent, found: FileFormat, options: ImportOptions) -
     conversion: Conversion = getattr(import_module(module), name)(content, options)
     if found.makes == "motion":
         parse_motion(conversion.text, Path("motion.yaml"))
-    else:
+    elif found.makes == "robot":
         compile_texts({"robot.yaml": conversion.text}, {}, conversion.urdf)
     return conversion

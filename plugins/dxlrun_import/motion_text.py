@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-import textwrap
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from dxlrun.tooling.files import Conversion, FileContent, ImportOptions
 from dxlrun_import.checked_values import valid_name
+from dxlrun_import.robot_draft import commented
 
 CONTROLLER = "arm"
 """Controller that plays a motion unless --controller names one, as in imported robot files."""
@@ -61,7 +61,7 @@ def motion_conversion(
     lines = [
         f"# {options.name}: imported from {content.path.name}, {origin}.",
         *(["# Not taken over:"] if remarks else []),
-        *(line for remark in remarks for line in _commented(remark)),
+        *(line for remark in remarks for line in commented(f"- {remark}")),
         "#",
         f"#   dxlrun ROBOT.yaml --play {options.name}.yaml",
         f"name: {options.name}",
@@ -72,10 +72,6 @@ def motion_conversion(
         *(_point(point, names) for point in points),
     ]
     return Conversion("\n".join(lines) + "\n", tuple(remarks))
-
-
-def _commented(remark: str) -> list[str]:
-    return [f"# {line}" for line in textwrap.wrap(f"- {remark}", 114, subsequent_indent="  ")]
 
 
 def _point(point: MotionPoint, names: Mapping[str, str]) -> str:

@@ -164,7 +164,7 @@ class RobotDraft:
     def _text(self, rate: float) -> str:
         guessed_rate = "" if rate == self.rate else "  # guessed: what the buses can keep; Hz"
         lines = [
-            *_commented(f"{self.name}: imported from {self.content.path.name}, {self.origin}."),
+            *commented(f"{self.name}: imported from {self.content.path.name}, {self.origin}."),
             "#",
             *self._commands(),
             "#",
@@ -172,7 +172,7 @@ class RobotDraft:
         ]
         if self.remarks:
             lines += ["# Not taken over:"]
-            lines += [line for remark in self.remarks for line in _commented(f"- {remark}")]
+            lines += [line for remark in self.remarks for line in commented(f"- {remark}")]
         lines += [f"name: {self.name}", "", "arguments:"]
         lines += [
             f'  {_argument(name, self.buses)}: {{default: sim, help: "serial port of the adapter, or sim"}}'
@@ -267,7 +267,8 @@ def _argument(bus: str, buses: Iterable[str]) -> str:
     return "port" if len([*buses]) == 1 else f"{bus}_port"
 
 
-def _commented(text: str) -> list[str]:
+def commented(text: str) -> list[str]:
+    """Return a text as lines of a comment."""
     lines = textwrap.wrap(text, _WIDTH - 4, subsequent_indent="  " if text[:1] == "-" else "")
     return [f"# {line}" for line in lines]
 

@@ -164,7 +164,7 @@ LAST = (
     FileFormat(
         "a parameter file of ROS 2 (ros2_control)",
         _is_ros2_parameters,
-        f"{_DRAFT}; docs/how-to/ros2.md explains how dxlrun and ROS 2 work together",
+        f"{_DRAFT}; docs/how-to/from-ros2-control.md has its terms next to ours",
     ),
     FileFormat(
         "a calibration of LeRobot, of its first version",
