@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +33,8 @@ def state(number: int, controller: str, origin: str, word: str) -> GoalState | B
         return KeyboardInterrupt()
     if word == "gone":
         return DxlrunError("torso no longer answers: closed")
-    running = GoalState(number, controller, "trajectory", origin, word, 0.5, 0.01, "")
+    word, _, progress = word.partition(" ")
+    running = GoalState(number, controller, "trajectory", origin, word, float(progress or 0.5), 0.01, "")
     return replace(running, **ENDS.get(word, {"ended": 2.0}))
 
 
@@ -45,6 +48,8 @@ class Robot:
         self.begun: dict[int, list[GoalState | BaseException]] = {}
         """Goals that begin while Ctrl-C comes before the answer"""
         self.requests: list[str] = []
+        self.drawn: list[str] = []
+        """Texts and progress of the progress bar"""
         self.ended: set[int] = set()
         self.mistakes: list[tuple[str, str, str]] = []
         self.goals_begin = True
@@ -76,6 +81,10 @@ class Robot:
         else:
             place, _, sentence = rest.partition(" ")
             self.mistakes.append((place, *sentence.split("; ")))  # type: ignore[arg-type]
+
+    @contextmanager
+    def progress_bar(self, *, hidden: bool) -> Iterator[Callable[[str, float], None]]:
+        yield lambda text, share: self.drawn.append(f"{text} {share:g}")
 
     def _executed(self, *numbers: int) -> Executed:
         if self.begun:
@@ -148,6 +157,7 @@ def robot(reader: Path, monkeypatch: pytest.MonkeyPatch) -> Robot:
     one = Robot()
     for room in (goals, parameters, play_room, steer):
         monkeypatch.setattr(room, "connect_robot", lambda name, verb: one)
+    monkeypatch.setattr(goals, "progress_bar", one.progress_bar)
     return one
 
 
@@ -161,7 +171,7 @@ def test_goal_at_the_terminal(dxlrun: Dxlrun, robot: Robot, reader: Path, case: 
         "no": lambda _: setattr(robot, "goals_begin", False),
         "at": lambda _: setattr(robot, "file", reader / "torso.yaml"),
     }
-    stage.asked = {"sent": lambda: robot.requests or ["nothing"]}
+    stage.asked = {"sent": lambda: robot.requests or ["nothing"], "drawn": lambda: robot.drawn}
     play(case, dxlrun, stage)
 
 

@@ -153,6 +153,18 @@ def test_large_terminal_has_controllers_and_events() -> None:
     assert text.count("something happened") == 3
 
 
+def test_measured_rate_is_that_of_the_last_second(monkeypatch: pytest.MonkeyPatch) -> None:
+    robot, cycles = Robot(), iter((100, 150, 160))
+    states = robot.states
+    monkeypatch.setattr(robot, "states", lambda: replace(states(), cycle=next(cycles)))
+    watched = watch.WatchedRobot(robot)  # type: ignore[arg-type]  # a stand-in
+    rates = []
+    for _ in range(3):
+        watched.poll_robot()
+        rates.append(watched.rate)
+    assert rates == [None, pytest.approx(50.0), pytest.approx(10.0)]
+
+
 def test_pipe_gets_one_snapshot(shown: Shown) -> None:
     robot = Robot(6)
     code, said = shown(robot)

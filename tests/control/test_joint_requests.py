@@ -144,6 +144,16 @@ def test_joint_that_is_given_torque_holds_where_its_first_reply_finds_it(story):
     assert story.events.texts(EventCode.POLICY) == [text]
 
 
+def test_joint_that_a_hand_turns_slowly_in_a_pause_is_anchored_there(story):
+    """A wheel may coast at the start of a pause. This one was at rest before, and is again at the end."""
+    story.script("wheel", commanding(velocity=0.0), joints=("j2",), command=("velocity",)).build()
+    turned = {cycle: story.shows(2, velocity=0.5, position=0.2 + 0.02 * cycle) for cycle in range(6, 14)}
+    at = {3: story.asks("pause"), 14: story.shows(2, velocity=0.0), 16: story.asks("resume")}
+    story.run(20, turned | at)
+    text = "restarted at the measured positions: j2 moved in the pause"
+    assert story.events.of(EventCode.POLICY) == [("wheel", text)]
+
+
 def test_a_long_list_is_cut_in_the_sentence_and_whole_in_its_fields():
     joints = tuple(f"j{row}" for row in range(20))
     refusal = Refusal(Code.UNKNOWN_JOINT, {"joint": joints})

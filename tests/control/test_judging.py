@@ -84,6 +84,18 @@ def test_a_goal_waits_until_its_joints_are_at_rest(velocity):
     assert goal.outcome is Outcome.REACHED
 
 
+def test_a_goal_does_not_settle_longer_than_its_timeout():
+    judged = Judged()
+    goal = judged.accept()
+    judged.states.position[:] = 0.5
+    defaults = np.full(2, NAN)
+    goal.judge(np.zeros(2), tolerances=GoalTolerances(defaults, defaults, left_ns=2 * PERIOD_NS))
+    judged.cycles(1)
+    assert goal.outcome is None
+    judged.cycles(1)
+    assert goal.outcome is Outcome.MISSED
+
+
 def test_a_lost_reply_at_the_end_of_a_motion_does_not_end_a_goal_without_settling_time():
     judged = Judged((0, 0))
     goal = judged.accept()
