@@ -78,3 +78,14 @@ def test_the_backup_of_every_model_fits_that_model_and_heals_it(tmp_path, protoc
         rig.one.write_registers(wanted)
         assert rig.sent().count(WRITE) == len(changed)
         assert all(rig.servo(1).registers[each.name] == each.value for each in changed)
+
+
+def test_a_mode_that_is_restored_resets_no_gain_of_the_backup(rig, tmp_path):
+    servo, table, path = rig.servo(1), rig.one.table, tmp_path / "servo.json"
+    servo.poke("position_p_gain", 640)
+    values = rig.one.read_items(servo_backup.kept_items(table), refused=True)
+    servo_backup.write_backup(path, servo_backup.stamped(table, 1, (1, RATE), values))
+    servo.poke("operating_mode", 1)
+    wanted = servo_backup.registers_to_restore(path, servo_backup.read_backup(path), table)
+    assert "Operating Mode (11) was changed from 1 to 3" in rig.one.restore(wanted, path)
+    assert servo.registers["position_p_gain"] == 640

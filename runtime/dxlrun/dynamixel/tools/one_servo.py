@@ -412,12 +412,14 @@ class OneServo(OneNode):
         names = ", ".join(each.name for each in differing)
         if not confirm(f"{self.called}: {names} are restored from {path}; ID and baud rate stay"):
             return ()
-        written = self.write_registers(desired)
-        # A restored mode resets other registers, so compare again.
-        if left := self.differences(desired):
-            names = ", ".join(each.name for each in left)
-            raise self.make_fault(f"{names} changed again during the restore; try again")
-        return written
+        written: tuple[str, ...] = ()
+        # A restored mode resets other registers, which are written in a second pass.
+        for _ in range(2):
+            written += self.write_registers(differing)
+            if not (differing := self.differences(desired)):
+                return written
+        names = ", ".join(each.name for each in differing)
+        raise self.make_fault(f"{names} changed again during the restore; try again")
 
     def _has_backup(self) -> None:
         if self.table.protocol == 1.0:
