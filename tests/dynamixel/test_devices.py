@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 import pytest
 from msgspec.structs import replace
+from tests.kit.line_faults import truncate_next
 from tests.kit.rigs import make_plan, make_rig, start_rig
 
 from dxlrun.channels.event_records import EventCode
@@ -232,6 +233,27 @@ def test_a_command_is_written_when_it_changes_and_now_and_then_and_ends_safe():
     poke(rig, "led", 1)
     rig.hardware.stop()
     assert device(rig).registers["led"] == 0
+
+
+def test_a_command_without_an_acknowledgement_is_written_again_at_once():
+    rig = started(("speed",), commands=("led",))
+    writes = []
+
+    def lose_first_reply():
+        writes.append(rig.clock.now_ns())
+        if len(writes) == 1:
+            truncate_next(rig.buses[0], 101, 0)
+
+    rig.when(lambda data: data[4] == 101 and data[7] == 0x03, lose_first_reply)
+    rig.device_commands[:] = 1.0
+    rig.cycles(10)
+    assert len(writes) == 2
+
+
+def test_an_item_that_counts_downward_has_its_range():
+    item = msgspec.structs.replace(read_device_table(TABLE.format(capabilities=ALL)).items["pwm"], scale=-0.5)
+    command = DeviceCommand.build("pwm", item, 0)
+    assert (command.lowest, command.highest) == (-442.5, 442.5)
 
 
 @pytest.mark.parametrize("silent", [False, True])

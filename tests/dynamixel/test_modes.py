@@ -255,6 +255,16 @@ def test_a_wheel_that_made_more_turns_than_its_servo_counts_does_not_wind_them_b
     assert (source, "outside its limits" in text) == ("main_1_joint", True)
 
 
+def test_a_wheel_that_coasted_a_little_over_its_last_turn_is_led_back_and_keeps_its_torque():
+    rig = make_wheel("MX-28", 1.0)
+    plan = rig.plans[0].servos[0]
+    upper = plan.mode_plan(P).upper_tick
+    turn_by_hand(rig.servo(1), (upper + 100) * plan.rad_per_tick)
+    change(rig, P)
+    assert rig.torque() == [True, True]
+    assert rig.servo(1).registers["goal_position"] == upper
+
+
 @pytest.mark.parametrize("beyond", [100, 800])
 def test_a_joint_that_coasted_over_its_limits_is_led_back_slowly_and_does_not_fall(beyond):
     arm = make_one("XM430-W350", 2.0, lower=-1.0, upper=1.0)

@@ -11,6 +11,7 @@ from dxlwire.exchange.owed import LEAST_WINDOW_NS, SLOW_MEMORY_NS, OwedReplies
 from dxlwire.plan.line import MOST_SPARE
 from dxlwire.plan.retry import ReplyLateness, extend_timeouts, retry
 from dxlwire.transaction import Program, Reply, Transaction
+from dxlwire.wire import protocol2
 
 READ = 2  # Instruction of Protocol 1.0
 MILLISECOND_NS = 1_000_000
@@ -93,6 +94,13 @@ def test_reading_from_before_a_write_is_no_answer_however_often_it_was_repeated(
     owed.write(write, 2)
     owed.miss(read, 3)
     assert owed.confuses(read, 4)
+
+
+def test_write_to_all_servos_invalidates_older_readings():
+    owed, read = Owed(), ONE.reading(64, 1)
+    owed.miss(read, 1)
+    owed.write(ONE.line.unanswered(protocol2.sync_write(64, 1, {ONE.servo.servo_id: b"\0"})), 2)
+    assert owed.confuses(read, 3)
 
 
 @pytest.mark.parametrize(("between", "confuses"), [(None, False), (ONE.writing(64, b"\1"), True)])

@@ -258,6 +258,17 @@ def deliver(terminal: PseudoTerminal, at_ns: int) -> None:
     terminal.deliver_bytes(at_ns)
 
 
+def test_what_a_host_wrote_to_an_unplugged_terminal_is_lost(terminal):
+    with opened(terminal.path) as port:
+        os.write(port, PING_1)
+        select.select([terminal], [], [])
+        terminal.read_chunk()
+        terminal.bus.unplug()
+        terminal.bus.plug_in()
+        assert terminal.follow_adapter()
+        assert terminal.deliver_bytes(1) == 0
+
+
 def test_a_terminal_without_a_host_is_reported_once(terminal):
     with select.epoll() as waiting:
         with opened(terminal.path) as port:
