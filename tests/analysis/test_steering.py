@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from msgspec import structs
 from rich.console import Console
 from tests.kit.stories import Asked, ask, rate, send, switch, tell
 
@@ -33,6 +34,7 @@ controllers:
 """
 INACTIVE = "head is not active; switch to it first"
 STREAMED = send("head", "positions", 0.1, 0.1, lease_ns=50 * MS)
+COMMAND = send("head", "positions", 0.1, 0.1)
 HAND_OVER = switch(["tail"], ["head"])
 ASKED: Asked = {
     5: [rate(100)],
@@ -109,6 +111,18 @@ def test_pause_is_counted_in_periods_and_in_seconds(report: Report) -> None:
     assert "periods paused" in shown
     assert "pair, 50 Hz and 100 Hz, 0.9 s" in shown
     assert "switch activate tail; deactivate head" in shown
+
+
+def test_refusal_is_that_of_its_command_among_equal_ones_of_a_cycle(tmp_path: Path) -> None:
+    report = analyze(run(tmp_path, {5: [COMMAND, HAND_OVER, COMMAND]}))
+    rows = [[cell.text for cell in row[2:]] for row in tables(report)["steering"].rows]
+    assert [row[-1] for row in rows] == ["done", "done", f"refused: {INACTIVE}"]
+
+
+def test_streams_of_two_clients_are_two(tmp_path: Path) -> None:
+    other = structs.replace(STREAMED, origin="bob")
+    report = analyze(run(tmp_path, {cycle: [other if cycle % 2 else STREAMED] for cycle in range(5, 9)}))
+    assert {row[3].text for row in tables(report)["steering"].rows} == {"anna", "bob"}
 
 
 @pytest.mark.parametrize(

@@ -63,6 +63,25 @@ def test_the_oldest_messages_are_left_out_for_a_slow_viewer() -> None:
     asyncio.run(run())
 
 
+def test_a_viewer_that_keeps_up_gets_every_message() -> None:
+    async def run() -> None:
+        connection = SlowConnection()
+        connection.let = asyncio.Semaphore(10**6)
+        viewer = Viewer(cast("ServerConnection", connection))
+        viewer.subscriptions[3] = 7
+        sending = asyncio.create_task(viewer.send_queued())
+        data = bytes(MOST_BYTES // 4)
+        for number in range(10):
+            viewer.queue_message(CHANNEL, number, data)
+            while len(connection.taken) <= number:
+                await asyncio.sleep(0)
+        sending.cancel()
+        assert [frame for frame in connection.taken if isinstance(frame, str)] == [], "a warning"
+        assert [int.from_bytes(frame[5:13], "little") for frame in connection.taken] == list(range(10))
+
+    asyncio.run(run())
+
+
 def test_a_viewer_that_takes_no_replies_is_gone() -> None:
     async def run() -> None:
         connection = SlowConnection()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import select
 import signal
 import socket
 import subprocess
@@ -693,6 +694,7 @@ def test_lost_line_is_requested_once_per_loss(tmp_path):
         for _ in range(2):
             assert reopen(0) is None
             assert reopen(0) is None
+            assert select.select([guardian], [], [], 0)[0], "the loss was not reported"
             assert guardian.receive_messages() == [LineLost(0)]
             guardian.send_message(LineReturned(0), [line.fileno()])
             descriptor = reopen(0)

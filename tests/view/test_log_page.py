@@ -13,6 +13,7 @@ from tests.view.served import Served
 
 import dxlrun_view.recorded_robot as module
 from dxlrun import open_log
+from dxlrun.log import log_reader
 from dxlrun.remote.network.listener import MOST_UNPROVED
 from dxlrun_view.page_server import mesh_file
 from dxlrun_view.recorded_robot import RecordedRobot
@@ -55,6 +56,7 @@ def test_fields_of_topics_are_drawn(recorded: RecordedRobot, serve: Serve) -> No
 def test_a_long_log_is_thinned_and_keeps_its_worst_cycles(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = RecordedRobot(log).describe_page()
     monkeypatch.setattr(module, "MOST_CYCLES", 100)
+    monkeypatch.setattr(log_reader, "SLICE_BYTES", 1)
     thin = RecordedRobot(log)
     shown = thin.describe_page()
     assert shown.every in (4, 8)

@@ -30,7 +30,7 @@ from dxlrun.log.schemas import LoggedController, LogHeader
 from dxlrun.output.target import new_target
 from dxlrun.plan.recording_plan import RecordingPlan
 from dxlrun.testing import VirtualRobot, plan_of, simulated_robot
-from dxlrun_analysis.export.arrow_tables import WITHOUT_TABLE
+from dxlrun_analysis.export.arrow_tables import WITHOUT_TABLE, tables_of
 from dxlrun_analysis.export.lerobot import write_dataset
 
 ROBOTS = Path(__file__).parents[3] / "robots"
@@ -290,6 +290,19 @@ def test_cycles_that_are_missing_end_an_episode(tmp_path: Path, export: Export) 
     assert [tuple(one[key] for key in keys) for one in episodes] == [(1, 0, 1), (2, 1, 3)]
     assert json.loads((tmp_path / "set/meta/info.json").read_text())["splits"] == {"train": "0:2"}
     np.testing.assert_allclose(episodes[1]["stats/observation.state/mean"], [0.25, 1.15], rtol=1e-6)
+
+
+def test_actions_are_those_of_the_joints_that_have_goals(tmp_path: Path, export: Export) -> None:
+    rows = tuple((number, (0.1, 1.0), (NAN, 0.5), (NAN, NAN)) for number in range(2))
+    assert export(made(tmp_path / "a.mcap", rows), tmp_path / "set", "lerobot").code == 0
+    assert frames(tmp_path / "set")["action"].to_pylist() == [0.5, 0.5]
+
+
+def test_time_goes_on_through_the_slices_of_a_log(tmp_path: Path) -> None:
+    log = read_log(made(tmp_path / "a.mcap"))
+    slices = [replace(log, cycles=log.cycles[at : at + 1]) for at in range(len(log.cycles))]
+    (rows,) = tables_of(slices, ["/cycle"])
+    assert rows.table["time_s"].to_pylist() == pytest.approx([0.0, 0.02, 0.08, 0.1])
 
 
 def test_a_data_set_is_the_same_however_the_log_is_sliced(tmp_path: Path) -> None:
