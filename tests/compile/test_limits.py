@@ -244,3 +244,14 @@ def test_command_of_a_client_is_refused_for_its_peak(
         send(fast)
     said = f"elbow is commanded to 1.2 rad/s at 1.500 s, {place}, more than 1 rad/s, its velocity limit"
     assert f"{said}: allow more time, 1.2 times as long" in str(refused.value)
+
+
+def test_values_of_a_command_belong_to_the_joints_that_it_names():
+    class Named(CommandModel):
+        joints: list[str]
+        positions: list[float]
+
+    found = beyond_limits(JOINTS, Named(joints=["arm", "free"], positions=[0.4, 1.5]))
+    assert found == []
+    (beyond,) = beyond_limits(JOINTS, Named(joints=["arm", "free"], positions=[0.6, 1.5]))
+    assert beyond.joint == "arm"

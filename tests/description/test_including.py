@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from tests.kit import desk
 from tests.kit.desk import TORSO
 
-from dxlrun.description.document import KeyPath, grow, literal, parse
+from dxlrun.description.document import KeyPath, confined, grow, literal, parse, read_file
 from dxlrun.description.including import MOST_FILES, MOST_LEVELS, merged
 from dxlrun.errors import Mark
 
@@ -162,6 +162,19 @@ def test_fragments_that_cannot_be_read_are_named_at_the_include() -> None:
         "broken.yaml:1:4: this [ is not closed; write ] at the end",
         "robot.yaml:1:35: folder.yaml: this is a directory; name a YAML file",
     ]
+
+
+@pytest.mark.parametrize("way", ["../secret.yaml", "inner/../../secret.yaml", "link.yaml"])
+def test_file_outside_of_the_permitted_folder_is_not_read(way: str) -> None:
+    folder = Path.cwd() / "robot"
+    (folder / "inner").mkdir(parents=True)
+    desk.write("loop: {rate: 10}\n", "secret.yaml")
+    (folder / "link.yaml").symlink_to(Path.cwd() / "secret.yaml")
+    (folder / "own.yaml").write_text("loop: {rate: 10}\n")
+    with confined(folder):
+        assert read_file(folder / "inner/../own.yaml")
+        with pytest.raises(PermissionError, match="outside the permitted folder"):
+            read_file(folder / way)
 
 
 KEYS = st.sampled_from(["a", "b", "c"])

@@ -318,6 +318,16 @@ def test_a_channel_whose_other_end_is_gone_still_gives_its_last_messages():
     ours.close()
 
 
+def test_a_message_that_comes_in_two_pieces_is_one():
+    ours, theirs = child_processes.message_channel(Decoder(GuardianMessage))
+    with theirs:
+        theirs.sendall(b'{"type": "Ended", ')
+        assert ours.receive_messages() == []
+        theirs.sendall(b'"ending": "done"}\n')
+        assert ours.receive_messages() == [Ended("done")]
+    ours.close()
+
+
 # The guardian's judgement, without its processes
 
 

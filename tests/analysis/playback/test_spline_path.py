@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dxlrun import ROTARY
-from dxlrun_analysis.playback.recorded_motion import RecordedMotion
+from dxlrun_analysis.playback.recorded_motion import RecordedMotion, Series
 from dxlrun_analysis.playback.spline_path import STATE_TOLERANCE, fit
 
 
@@ -25,6 +25,11 @@ def motion(times: np.ndarray, *columns: np.ndarray) -> RecordedMotion:
         0.0,
         (ROTARY,) * len(names),
     )
+
+
+def test_of_several_positions_at_one_time_the_last_counts() -> None:
+    series = Series(np.array([2.0, 1.0, 1.0, 0.0]), np.array([4.0, 1.0, 2.0, 3.0]), "states").ordered()
+    assert (series.time_s.tolist(), series.position.tolist()) == ([0.0, 1.0, 2.0], [3.0, 2.0, 4.0])
 
 
 numbers = st.floats(-3, 3, allow_nan=False)

@@ -97,3 +97,9 @@ def test_the_mask_of_controllers_has_an_end():
 @pytest.mark.parametrize("rate", [50, 320, 1000])
 def test_the_ring_holds_ten_seconds(rate):
     assert cycle_capacity(1_000_000_000 // rate, 1000) >= 10 * rate * record_size(1000)
+
+
+def test_states_of_a_source_are_its_own():
+    layout = CycleLayout((), (), (), {"imu": ("x", "y"), "imu2": ("x",)})
+    slices = [layout.source_slice(source) for source in ("imu", "imu2", "im")]
+    assert slices == [slice(0, 2), slice(2, 3), slice(0, 0)]
