@@ -13,7 +13,7 @@ in their place, and the result:
 
 The lines to replace occur once in the file; a fault whose lines are gone cannot be tried any more. The fault
 is applied to this checkout, which must be clean and installed with `pip install -e`, and is taken back at the
-end. Its tests are the short ones of its room, and those that name its module (tests/faults/trials.py).
+end. Its tests are the short ones that execute it, or those of its room (tests/faults/trials.py).
 """
 
 from __future__ import annotations

@@ -3,9 +3,9 @@
     pytest --cov --cov-context=test --cov-report=    # once: .coverage has the tests that execute each line
     python tests/faults/faults.py --try control.txt
 
-First run the tests that execute a function of the fault in the process of pytest, then the others of its
-room, and those that name its module. pytest collects them once; for each fault a copy of that process (fork)
-gives the functions of the faulty file their new code, and what tests start themselves reads the faulty file.
+The tests that execute a function of the fault in the process of pytest run; where there are none, those of
+its room, and those that name its module. pytest collects them once; for each fault a copy of that process
+(fork) gives the functions of the faulty file their new code, and what tests start themselves reads that file.
 A fault in C, or outside of functions, has a pytest of its own. A test that fails without the fault too has
 not found it, and what takes longer than the limit finds nothing: nobody would wait for it.
 """
@@ -36,7 +36,7 @@ from tests.faults import faults
 from tests.faults.faults import ROOT, Fault
 from tests.kit import selection
 
-LIMIT_S = 120.0
+LIMIT_S = 60.0
 FORK = multiprocessing.get_context("fork")
 NOT_LOADED = "not loaded"
 
@@ -84,9 +84,11 @@ class Trial(NamedTuple):
         own = {*tests_of(self.fault.path)}
         ranks = {file: rank for rank, file in enumerate(self.files)}
         by_file = [(item.nodeid.partition("::")[0], item) for item in items]
-        chosen = [(file, item) for file, item in by_file if file in own or item.nodeid in self.executing]
-        chosen.sort(key=lambda one: (one[1].nodeid not in self.executing, ranks[one[0]]))
-        return [item for _, item in chosen]
+        if self.executing:
+            chosen = [(file, item) for file, item in by_file if item.nodeid in self.executing]
+        else:
+            chosen = [(file, item) for file, item in by_file if file in own]
+        return [item for _, item in sorted(chosen, key=lambda one: ranks[one[0]])]
 
 
 def trial_of(fault: Fault, covered: CoverageData) -> Trial:
