@@ -364,3 +364,21 @@ def test_no_modules_import_each_other_in_a_circle() -> None:
         tuple(TopologicalSorter(found).static_order())
     except CycleError as circle:
         pytest.fail(" <- ".join(circle.args[1]))
+
+
+def missing_tests(text: str) -> list[str]:
+    """Return the test files that a text names, as `tests/log/test_{log,recorder}.py`, and that are gone."""
+    named = []
+    for start, names, end in re.findall(r"(tests/[\w/]*)(?:\{([\w,]+)\})?(\w*\.py)", text):
+        named += [f"{start}{name}{end}" for name in names.split(",")]
+    return [name for name in named if not (ROOT / name).is_file()]
+
+
+def test_programs_of_bench_name_tests_that_there_are() -> None:
+    """Nothing else runs these programs."""
+    assert missing_tests("tests/log/test_{log,gone}.py tests/gone.py") == [
+        "tests/log/test_gone.py",
+        "tests/gone.py",
+    ]
+    found = {path.name: missing_tests(path.read_text("utf-8")) for path in ROOT.glob("bench/*.py")}
+    assert {name: gone for name, gone in found.items() if gone} == {}
