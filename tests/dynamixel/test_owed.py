@@ -142,3 +142,16 @@ def test_lost_reply_is_not_lateness_of_the_next_one(register):
     assert reply.answered
     assert all(each < MILLISECOND_NS for each in times.late_ns)
     assert times.missing == 1
+
+
+def test_a_bus_without_power_is_given_up_within_two_seconds():
+    rig = start_rig(PLAN)
+    rig.servo(11).silence()
+
+    def program() -> Program[None]:
+        for _ in range(30):
+            yield from retry(ONE.reading(64, 1))
+
+    begun_ns = rig.clock.now_ns()
+    rig.lines.run_programs([extend_timeouts(program())])
+    assert rig.clock.now_ns() - begun_ns < 2_000 * MILLISECOND_NS

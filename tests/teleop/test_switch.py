@@ -31,6 +31,7 @@ policies: {on_stale_command: limp}  # a stream that is not ended in order ends t
 """
 GOAL_POSITION, TICKS = 116, 4096 / 360
 FREE, HELD = InputState((0.0,), False), InputState((1.0,), True)
+BACK = InputState((-1.0,), True)
 NEXT = InputState((1.0,), True, frozenset({Press.NEXT}))
 
 
@@ -98,6 +99,14 @@ def test_a_joint_that_is_as_fast_as_it_may_be_stops_when_it_is_released(tmp_path
     slow = ROBOT.replace("limits: {", "limits: {velocity: 0.4 rad/s, ")
     found = moves(driven(tmp_path, (0.5, HELD), (1.0, FREE), (1.6, FREE), factor=4.0, text=slow))
     assert 0.9 < max(at for at, _ in found[1]) < 1.25
+
+
+def test_a_joint_that_is_as_fast_as_it_may_be_turns_back_at_once(tmp_path: Path) -> None:
+    slow = ROBOT.replace("limits: {", "limits: {velocity: 0.4 rad/s, ")
+    script = (0.5, HELD), (1.0, BACK), (1.5, FREE)
+    goals = moves(driven(tmp_path, *script, factor=4.0, text=slow))[1]
+    turned_s, _ = max(goals, key=lambda goal: goal[1])
+    assert 0.9 < turned_s < 1.15
 
 
 def test_targets_choose_joints_in_their_order_and_what_no_controller_takes_is_refused(
