@@ -2,11 +2,13 @@
 
 import os
 import select
+from types import SimpleNamespace
 
 import pytest
 from tests.kit.awaited import DEADLINE_S
 
 from dxlwire.exceptions import PortError
+from dxlwire.port import reopening
 from dxlwire.port.reopening import KeptLines, LineSettings, lasting_name
 
 
@@ -76,6 +78,21 @@ def test_while_a_line_is_gone_nobody_has_its_old_device_open(adapters, kept):
     assert os.readlink(f"/proc/self/fd/{kept.descriptors[0]}") == os.devnull
     adapters[0].plug_in()
     assert returned(kept) == [0]
+
+
+def test_a_line_is_back_soon_after_its_adapter(adapters, kept, monkeypatch):
+    pauses = []
+
+    def sleep(pause_s):
+        pauses.append(pause_s)
+        if sum(pauses) > 10.0 and not adapters[0].link.exists():
+            adapters[0].plug_in()
+
+    monkeypatch.setattr(reopening, "time", SimpleNamespace(sleep=sleep))
+    adapters[0].unplug()
+    kept.lost(0)
+    assert returned(kept) == [0]
+    assert 10.0 < sum(pauses) <= 10.0 + reopening.LONGEST_PAUSE_S
 
 
 def test_both_lines_may_be_gone_at_once_and_come_back_in_any_order(adapters, kept):
