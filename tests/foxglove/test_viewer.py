@@ -9,6 +9,7 @@ from typing import Any, cast
 from websockets.asyncio.server import ServerConnection
 
 from dxlrun.log.schemas import CYCLE
+from dxlrun_foxglove.foxglove_server import FoxgloveServer
 from dxlrun_foxglove.viewer import MOST_BYTES, MOST_REPLIES, SLOW, Channel, Viewer
 
 CHANNEL = Channel(3, "/cycle", CYCLE, latched=False)
@@ -80,6 +81,16 @@ def test_a_viewer_that_keeps_up_gets_every_message() -> None:
         assert [int.from_bytes(frame[5:13], "little") for frame in connection.taken] == list(range(10))
 
     asyncio.run(run())
+
+
+def test_a_closed_plot_ends_its_own_subscription() -> None:
+    viewer = Viewer(cast("ServerConnection", SlowConnection()))
+    viewer.subscriptions = {3: 7, 7: 3}
+    server = FoxgloveServer("robot", (), control=False)
+    server._process_frame(
+        viewer, cast("Any", None), json.dumps({"op": "unsubscribe", "subscriptionIds": [7]})
+    )
+    assert viewer.subscriptions == {7: 3}
 
 
 def test_a_viewer_that_takes_no_replies_is_gone() -> None:
