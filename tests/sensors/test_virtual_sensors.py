@@ -203,21 +203,6 @@ def test_a_sensor_that_never_brought_a_sample_ends_the_run_too(crane, monkeypatc
     assert "sensor imu delivered nothing for 80 ms; on_fault: " in result.detail
 
 
-def test_value_that_a_driver_does_not_set_is_not_its_last_one(crane, monkeypatch):
-    robot = VirtualRobot(plan_of(crane(), duration_s=0.5))
-    left = []
-
-    def set_first(values: np.ndarray) -> int:
-        left.append(values.tolist())
-        values[0] = 1.0
-        return robot.clock.now_ns()
-
-    monkeypatch.setattr(robot.drivers["imu"], "read", set_first)
-    robot.run()
-    assert len(left) > 2
-    assert np.isnan(left).all()
-
-
 def test_a_driver_that_raises_is_an_event_and_is_opened_again(crane, tmp_path, monkeypatch):
     log = tmp_path / "run.mcap"
     robot = VirtualRobot(plan_of(crane(), duration_s=3.0), log=log)
