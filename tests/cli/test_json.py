@@ -25,6 +25,7 @@ SUCCESSFUL = {
     "examples": "examples",
     "export": "export run.mcap cycles.csv --format csv",
     "frames": "frames robots/bioloid_torso.yaml",
+    "import": "import pan.csv",
     "latency": "latency --count 100 --no-record",
     "models": "models AX-12A",
     "new-plugin": "new-plugin my_robotics",
@@ -85,6 +86,7 @@ def test_refusal_of_every_command_is_an_answer(dxlrun: Dxlrun, verb: str) -> Non
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("answers")
     (place / "robots").symlink_to(ROOT / "robots")
+    (place / "pan.csv").write_text("time,pan\n0,0\n1,0.5\n")
     simulated_robot(ROOT / "robots/single_joint.yaml", duration_s=0.5, log=place / "run.mcap").run()
     return place
 

@@ -179,7 +179,7 @@ LAST = (
     FileFormat(
         "a program in Python",
         _is_python,
-        "give a robot file; for a controller, write `type: ./{name}:CLASS` in it",
+        "to use a controller in it, write `type: ./{name}:CLASS` in a robot file",
     ),
 )
 """Signatures that are compared after the formats with a converter, the most general ones last."""

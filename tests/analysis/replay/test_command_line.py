@@ -68,7 +68,7 @@ def test_remarks_go_to_stderr(
     ("arguments", "says"),
     [
         (["missing.mcap"], "log missing.mcap not found"),
-        ([__file__], "this is not an MCAP file"),
+        ([__file__], "this is a program in Python"),
         (["{log}", "fast"], "'fast' is not an argument of the robot file"),
         (["{log}", "--set", "neck.gain=1"], "the log has no such controller"),
         (["{log}", "--set", "all_inputs.gian=1"], "dxlrun: --set all_inputs has an unknown key 'gian'; did"),
