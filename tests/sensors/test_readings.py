@@ -218,20 +218,17 @@ def test_a_time_in_the_future_is_now_and_hides_no_silence(desk):
 
 
 def test_reading_allocates_nothing_that_stays(desk):
-    def some(count: int) -> None:
-        for _ in range(count):
-            desk.sample(1.0)
-            desk.cycle(1)
-
+    """Threads beside the test allocate as well, but not in each of five rounds."""
+    sizes = []
     desk.other.write_sample(desk.now_ns, np.zeros(2))
-    some(100)
-    desk.events.clear()
     tracemalloc.start()
     try:
-        some(10)
-        before, _ = tracemalloc.get_traced_memory()
-        some(2000)
-        after, _ = tracemalloc.get_traced_memory()
+        for _ in range(6):
+            for _ in range(400):
+                desk.sample(1.0)
+                desk.cycle(1)
+            desk.events.clear()
+            sizes.append(tracemalloc.get_traced_memory()[0])
     finally:
         tracemalloc.stop()
-    assert after - before < 2000  # a byte for each cycle would be as much
+    assert min(np.diff(sizes)) < 400  # a byte for each cycle would be as much
