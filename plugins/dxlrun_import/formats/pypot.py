@@ -92,7 +92,8 @@ def _joint(content: FileContent, motor: str, bus: str, draft: RobotDraft) -> Joi
         comment=f"pypot: offset {offset:g}, {orientation}, angle_limit {low:g} to {high:g}",
     )
     table = draft.control_table(joint)
-    assert table is not None  # noqa: S101 (pypot names every model)
+    if table is None:
+        raise content.refusal(f"type of {motor} is {model!r}", "write the model of the servo", *at, "type")
     return joint._replace(reference=middle(table) + sign * offset)
 
 

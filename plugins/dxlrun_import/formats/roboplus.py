@@ -26,7 +26,7 @@ _BY_HAND = "write its motions by hand; docs/how-to/import.md"
 
 @dataclass
 class MotionPage:
-    """MotionPage of a motion file."""
+    """Page of a motion file."""
 
     mark: Mark
     number: int

@@ -12,6 +12,10 @@ _ROSBAGS = (
     "`rosbags-convert --src {path} --dst {stem} --dst-storage mcap` (from `pip install rosbags`) converts it "
     "to MCAP for `dxlrun replay --on` and `dxlrun convert`"
 )
+_PAGES = (
+    "write its pages as motions of a keyframe_player; `dxlrun examples bioloid_torso_keyframes` copies a "
+    "robot with such motions"
+)
 _EPISODE = "write one episode as CSV, with times and joints, and import that; docs/how-to/import.md"
 _ACTION_BYTES, _ACTION_PAGE = 131072, 512
 """Bytes of ROBOTIS' action file: 256 pages of 512"""
@@ -125,8 +129,7 @@ FIRST = (
     FileFormat(
         "an action file of ROBOTIS (OP2, OP3)",
         _is_action,
-        "write its pages as motions of a keyframe_player; `dxlrun examples bioloid_torso_keyframes` copies a "
-        "robot with such motions",
+        _PAGES,
     ),
     FileFormat(
         "a xacro file, which makes a URDF",
@@ -148,6 +151,11 @@ LAST = (
     ),
     FileFormat(
         "a model of Gazebo (SDF): a body without servos", lambda content: content.top == "sdf", _DRAFT
+    ),
+    FileFormat(
+        "a motion file of R+ Motion (.mtnx)",
+        lambda content: content.top == "Root" and content.xml.get("type") == "motion",
+        _PAGES,
     ),
     FileFormat("XML", lambda content: bool(content.top), f"give a robot file in YAML; {_DRAFT}"),
     FileFormat(
