@@ -19,6 +19,7 @@ from dxlrun.remote.preparation import Preparation
 from dxlrun.remote.requests.request_table import Role
 from dxlrun_controllers import group
 from dxlrun_controllers.motions.joint_trajectory_controller import JointTrajectoryController
+from dxlrun_controllers.motions.keyframe_player import KeyframePlayer
 
 JOINTS = (JointPlan("pan", -1.0, 1.0, 2.0), JointPlan("tilt", -1.0, 1.0, 2.0))
 TYPES = {
@@ -321,3 +322,13 @@ def test_the_way_begins_at_the_goal_of_a_joint_not_where_it_lags_behind(head):
 @pytest.mark.parametrize(("position", "seconds"), [(0.204, 0.0), (0.206, 0.2), (0.22, 0.2), (0.4, 0.4)])
 def test_a_short_way_takes_its_least_time_and_one_of_a_few_ticks_none(head, position, seconds):
     assert lead_to(head, position)[0][-1] == pytest.approx(seconds)
+
+
+def test_motion_that_loops_has_no_length():
+    steps = [{"time": "500 ms", "pose": {"pan": "0 rad"}}]
+    motions = {"once": {"steps": steps}, "round": {"steps": steps, "next": "round", "exit": "once"}}
+    player = PlugIns({"player": Offer("player", KeyframePlayer, "tests 1")}, {})
+    keys = json.dumps({"joints": ["pan"], "motions": motions})
+    plan = ControllerPlan("pages", "player", "tests 1", keys, ("pan",), ("position",), (), True, 1)
+    prepared = Preparation({joint.name: joint for joint in JOINTS}, player)
+    assert prepared.motions(plan) == {"once": 0.5, "round": None}

@@ -1,12 +1,14 @@
 """keyframe_player: play named motions of poses, each pose with a time, a pause and torque limits.
 
 Motions are structured like ROBOTIS' motion pages (e-Manual, RoboPlus Motion). A step has a pose, a play time
-and a pause; a page has a number of repetitions, a speed and a next page. The way between two poses is a
-cubic: Biagiotti and Melchiorri, Trajectory Planning for Automatic Machines and Robots (2008), section 2.1.
+and a pause; a page has a number of repetitions, a speed, a next page and an exit page. The way between two
+poses is a cubic: Biagiotti and Melchiorri, Trajectory Planning for Automatic Machines and Robots (2008),
+section 2.1.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from typing import Annotated, ClassVar, Literal
 
@@ -87,7 +89,9 @@ class Motion(ParametersModel):
     speed: Annotated[float, Field(gt=0, le=10)] = 1.0
     """Divisor of all times and pauses."""
     next: str | None = None
-    """Name of the motion that follows."""
+    """Name of the motion that follows. Motions in a circle are played until a cancel."""
+    exit: str | None = None
+    """Name of the motion that is played once after the steps at a cancel, and then its own `exit`."""
 
     def duration_s(self, repeat: int) -> float:
         """Return the duration of the steps with `repeat` repetitions at the motion's own speed, s."""
@@ -120,7 +124,7 @@ class KeyframeParameters(ParametersModel):
     """Motion that starts whenever the controller is activated, except after a joint has regained torque."""
 
     def mistakes(self) -> Iterator[Mistake]:
-        """Yield unknown names of motions and joints, and motions that follow each other in a circle."""
+        """Yield unknown names of motions and joints, and motions whose exits form a circle."""
         yield from super().mistakes()
         known = f"the motions are {', '.join(self.motions)}"
         for index, joint in enumerate(self.wrap):
@@ -135,17 +139,18 @@ class KeyframeParameters(ParametersModel):
                         if joint not in self.joints:
                             place = ("motions", name, "steps", number, key, joint)
                             yield place, f"{joint} is {not_one_of(self.joints)}"
-            if motion.next is not None and motion.next not in self.motions:
-                yield ("motions", name, "next"), f"motion {motion.next} is not defined; {known}"
-        for circle in self._circles():
+            for key, other in (("next", motion.next), ("exit", motion.exit)):
+                if other is not None and other not in self.motions:
+                    yield ("motions", name, key), f"motion {other} is not defined; {known}"
+        for circle in self._circles_of_exits():
             way = " -> ".join((*circle, circle[0]))
             yield (
-                ("motions", circle[0], "next"),
-                f"motions follow each other in a circle: {way}; remove one `next`",
+                ("motions", circle[0], "exit"),
+                f"exits follow each other in a circle, so a cancel never ends: {way}; remove one `exit`",
             )
 
-    def _circles(self) -> Iterator[list[str]]:
-        """Yield the names of the motions of each circle of `next`, starting with the first one in the
+    def _circles_of_exits(self) -> Iterator[list[str]]:
+        """Yield the names of the motions of each circle of `exit`, starting with the first one in the
         file.
         """
         done: set[str] = set()
@@ -155,26 +160,42 @@ class KeyframeParameters(ParametersModel):
             while after in self.motions and after not in done:
                 way.append(after)
                 done.add(after)
-                after = self.motions[after].next
+                after = self.motions[after].exit
             if after in way:
                 yield way[way.index(after) :]
 
-    def chain(self, name: str | None) -> Iterator[str]:
-        """Yield a motion's name and the names of all motions that follow it; nothing for None."""
-        while name is not None:
-            yield name
-            name = self.motions[name].next
+    def chain(self, name: str, rounds: int = 1) -> Iterator[str]:
+        """Yield a motion's name and the names of the motions that follow it; those of a circle `rounds`
+        times.
+        """
+        counts = dict.fromkeys(self.motions, 0)
+        after: str | None = name
+        while after is not None and counts[after] < rounds:
+            counts[after] += 1
+            yield after
+            after = self.motions[after].next
 
-    def steps(self, first: str, repeat: int) -> Iterator[tuple[str, int, Step]]:
-        """Yield motion name, step number (from 1) and step in the order of playing, for a motion and its
-        followers.
+    def exits(self, name: str) -> Iterator[str]:
+        """Yield the names of the motions that are played after a motion when the goal is cancelled."""
+        after = self.motions[name].exit
+        while after is not None:
+            yield after
+            after = self.motions[after].exit
+
+    def loops(self, name: str) -> bool:
+        """Return True if a motion is followed by a circle of motions, or is part of one."""
+        *_, last = self.chain(name)
+        return self.motions[last].next is not None
+
+    def length_s(self, name: str, repeat: int) -> float:
+        """Return the duration of a motion and its followers at speed 1, s; infinite if they loop.
 
         `repeat` replaces the repetitions of the first motion.
         """
-        for name in self.chain(first):
-            for _ in range(repeat if name == first else self.motions[name].repeat):
-                for number, step in enumerate(self.motions[name].steps, 1):
-                    yield name, number, step
+        if self.loops(name):
+            return math.inf
+        first, *others = [self.motions[one] for one in self.chain(name)]
+        return first.duration_s(repeat) + sum(other.duration_s(other.repeat) for other in others)
 
     def first_torque(self) -> tuple[str | int, ...]:
         """Return the path in the parameters of the first `torque` with a limit; empty if there is none."""
@@ -201,12 +222,15 @@ class KeyframePlayer(Controller[KeyframeParameters]):
     """Controller that plays one motion at a time and holds the last pose.
 
     A motion starts from the last goals of the joints and their present speed, also when a new goal replaces
-    an active one. After a cancel each joint decelerates to a stop, at its acceleration limit.
+    an active one. A cancelled motion that loops or has an exit completes its steps and plays the exit. After
+    a second cancel, or a cancel of any other motion, each joint decelerates to a stop at its acceleration
+    limit.
     """
 
     Parameters = KeyframeParameters
     Commands: ClassVar = {"play": PlayCommand}
     Goals: ClassVar = frozenset({"play"})
+    graceful = True
 
     @classmethod
     def interfaces(cls, parameters: KeyframeParameters, joints: tuple[str, ...]) -> Interfaces:
@@ -224,8 +248,7 @@ class KeyframePlayer(Controller[KeyframeParameters]):
     def motions(cls, parameters: KeyframeParameters) -> Mapping[str, float]:
         """Return motion -> duration at speed 1, including the motions that follow, s."""
         known = parameters.motions
-        lengths = {name: motion.duration_s(motion.repeat) for name, motion in known.items()}
-        return {name: sum(map(lengths.__getitem__, parameters.chain(name))) for name in known}
+        return {name: parameters.length_s(name, motion.repeat) for name, motion in known.items()}
 
     @classmethod
     def speed_peaks(
@@ -240,11 +263,11 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         at: dict[str, float] = {}
         highest: dict[str, SpeedPeak] = {}
         begin_s = 0.0
-        for name in parameters.chain(first):
+
+        def add_peaks(name: str, rounds: int) -> None:
+            nonlocal begin_s
             motion = parameters.motions[name]
             rate = min(speed * motion.speed * parameters.speed, HIGHEST_RATE)
-            # From the second repetition on, all repetitions are the same.
-            rounds = min(repeat if name == first else motion.repeat, 2)
             for number, step in [*enumerate(motion.steps, 1)] * rounds:
                 moved = [joint for joint in step.pose if joint in at]
                 time_s = step.time * 1e-9 / rate
@@ -264,6 +287,14 @@ class KeyframePlayer(Controller[KeyframeParameters]):
                         highest[joint] = SpeedPeak(joint, peak, begin_s + time, where, key)
                 at.update(pose)
                 begin_s += time_s + step.pause * 1e-9 / rate
+
+        # From the second repetition of a motion or a circle on, all repetitions are the same.
+        for index, name in enumerate(parameters.chain(first, 2)):
+            add_peaks(name, min(repeat if index == 0 else parameters.motions[name].repeat, 2))
+            before, before_s = at.copy(), begin_s
+            for left in parameters.exits(name):
+                add_peaks(left, 1)
+            at, begin_s = before, before_s
         yield from highest.values()
 
     @classmethod
@@ -315,7 +346,7 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         self._limp.fill(False)
         self._out.fill(False)
         self._goal: Goal | None = None
-        self._playing = self._stopping = False
+        self._playing = self._stopping = self._leaving = False
         self._unknown = True
         self._starting = self.parameters.start is not None
 
@@ -340,13 +371,13 @@ class KeyframePlayer(Controller[KeyframeParameters]):
     def _begin_motion(self, motion: str, speed: float, repeat: int) -> None:
         """Start a motion by name from the present goals and velocities, first slowly to its first pose."""
         self._now.velocity *= self._rate if self._playing or self._stopping else 0.0
-        self._playing, self._stopping, self._starting = True, False, False
+        self._playing, self._stopping, self._leaving, self._starting = True, False, False, False
         self._asked.fill(np.nan)
         parameters = self.parameters
         self._name, self._goal_speed = motion, speed
-        self._steps = parameters.steps(motion, repeat)
-        self._motions = first, *others = [parameters.motions[name] for name in parameters.chain(motion)]
-        self._total_s = first.duration_s(repeat) + sum(other.duration_s(other.repeat) for other in others)
+        self._number, self._left = 0, repeat
+        self._motions = [parameters.motions[name] for name in parameters.chain(motion)]
+        self._total_s = parameters.length_s(motion, repeat)
         self._done_s = self._time_s = self._step_s = self._pause_s = 0.0
         self._rate = self._wanted_rate()
         np.copyto(self._missed, self._limp)
@@ -354,10 +385,15 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         self._next_step(softly=True)
 
     def on_cancel(self, goal: Goal, time_ns: int) -> None:
-        """Decelerate each joint to rest; the goal ends then. A goal whose motion is over is not changed."""
+        """Decelerate each joint to rest, or first complete a motion that loops or has an exit. The goal ends
+        then. A goal whose motion is over is not changed.
+        """
         if self._stopping:
             return
         if not self._playing:  # the motion is over, and the runtime is judging its goal
+            return
+        if not self._leaving and (self._motion.exit is not None or self.parameters.loops(self._name)):
+            self._leaving = True
             return
         self._now.velocity *= self._rate
         self._rate = 1.0
@@ -452,10 +488,10 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         Returns:
             False if there are no more steps.
         """
-        following = next(self._steps, None)
-        if following is None:
+        name = self._name_of_next_step()
+        if name is None:
             return False
-        name, self._number, step = following
+        step = self.parameters.motions[name].steps[self._number - 1]
         if name != self._name:
             before, self._name = self._rate, name
             self._rate = self._wanted_rate()
@@ -485,6 +521,22 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         np.copyto(self.context.commands.effort, torque, where=np.isfinite(torque))
         return True
 
+    def _name_of_next_step(self) -> str | None:
+        """Count the steps and repetitions, and return the motion of the next step; None after the last one.
+
+        After a cancel, a motion is not repeated, and its exit follows.
+        """
+        motion = self._motion
+        self._number += 1
+        if self._number <= len(motion.steps):
+            return self._name
+        self._number, self._left = 1, self._left - 1
+        if self._left > 0 and not self._leaving:
+            return self._name
+        name = motion.exit if self._leaving else motion.next
+        self._left = 1 if name is None else self.parameters.motions[name].repeat
+        return name
+
     def _decelerate(self, dt: float) -> None:
         self._time_s += dt
         self._stop.sample(self._time_s, self._now)
@@ -507,7 +559,13 @@ class KeyframePlayer(Controller[KeyframeParameters]):
     # The end
 
     def _hand_over(self) -> None:
-        """Pass the goal to the runtime, which judges it by the last requested pose of each joint."""
+        """Pass the goal to the runtime, which judges it by the last requested pose of each joint.
+
+        A cancelled goal ends without judgement.
+        """
+        if self._leaving:
+            self._finish(Outcome.CANCELLED, f"played {self._name}")
+            return
         moved, text = self._moved_joints(f"played {self._name}")
         if not moved:
             self._finish(Outcome.ABORTED, f"played {self._name}")

@@ -3,7 +3,8 @@
 Source: ROBOTIS' e-Manual ("RoboPlus Motion"), and arrays that users made of such files. `play_param` has next
 page, exit page, repetitions, speed and inertial force. A step has a position for each entry of `enable` (the
 first is not used), the pause and the time, s. Pages count from 1. Bit 14 marks a joint that a step does not
-move [i: as in ROBOTIS' binary pages].
+move [i: as in ROBOTIS' binary pages]. A compliance of 5 is a slope of 32, the default of an AX-12 [i: 1..7
+are the slopes 2..128].
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ MIDDLE, STEP_DEG = 512, 300 / 1023  # of an AX-12
 SPEED_DEG = 300.0  # mean speed: the peak of a cubic is 1.5 times as high, and an AX-12 reaches 472 deg/s
 SHORTEST_S = 0.01  # of a step of a keyframe_player
 _UNMOVED = 0x4000
-_USUAL_COMPLIANCE = 5
+_USUAL_COMPLIANCE, _COMPLIANCES = 5, range(1, 8)
 _BY_HAND = "write its motions by hand; docs/how-to/import.md"
 
 
@@ -36,6 +37,7 @@ class MotionPage:
     steps: list[list[float]] = field(default_factory=list)
     name: str = ""
     follower: MotionPage | None = None
+    exit: MotionPage | None = None
 
 
 def convert(content: FileContent, options: ImportOptions) -> Conversion:
@@ -51,49 +53,69 @@ def convert(content: FileContent, options: ImportOptions) -> Conversion:
                 what = f"a position of ID {number} is above 1023, so it is not an AX servo"
                 raise refused(page.mark, what, _BY_HAND)
         joint = JointDraft(f"joint_{number}", number, content.mark(), "AX-12A")
+        joint = joint._replace(registers=_slopes(number, used, draft))
         draft.add_joint(joint._replace(comment="guessed: name, model, direction"))
     for page in used:
         name = valid_name(page.title) if page.title else f"page_{page.number}"
         page.name = f"{name}_{page.number}" if any(name == one.name for one in used) else name
     for page in used:
-        _link(page, pages, draft)
+        page.follower = _linked(page.param[0], pages)
+    for page in used:
+        _set_exit(page, _linked(page.param[1], pages), draft)
     lines = ["  pages:", "    type: keyframe_player"]
     lines += [*wrapped("    joints: [", [*draft.joints], "]"), "    motions:"]
     for page in used:
-        before = [one for one in used if one.follower is page or (one is page and page.param[2] > 1)]
+        before = [
+            one for one in used if page in (one.follower, one.exit) or (one is page and page.param[2] > 1)
+        ]
         lines += _motion(page, ids, [one.steps[-1] for one in before], draft)
     draft.controllers = lines
     return draft.conversion()
 
 
-def _link(page: MotionPage, pages: Sequence[MotionPage], draft: RobotDraft) -> None:
-    """Set the follower of a page, unless it closes a circle, which a `keyframe_player` refuses."""
-    number = int(page.param[0])
-    follower = pages[number - 1] if 0 < number <= len(pages) and pages[number - 1].steps else None
-    way = follower
+def _linked(number: float, pages: Sequence[MotionPage]) -> MotionPage | None:
+    """Return the page with a number; None if it has no steps or does not exist."""
+    return pages[int(number) - 1] if 0 < number <= len(pages) and pages[int(number) - 1].steps else None
+
+
+def _set_exit(page: MotionPage, leaves: MotionPage | None, draft: RobotDraft) -> None:
+    """Set the exit of a page, unless it closes a circle of exits, after which a stop would never end."""
+    way = leaves
     while way is not None and way is not page:
-        way = way.follower
+        way = way.exit
     if way is None:
-        page.follower = follower
-        return
-    remark = f"it repeats by its next page {number} until a stop; here it ends"
-    draft.remarks.append(f"page {page.name}: {remark}")
+        page.exit = leaves
+    else:
+        draft.remarks.append(f"page {page.name}: its exit page {int(page.param[1])}, which leads back to it")
+
+
+def _slopes(number: int, used: Sequence[MotionPage], draft: RobotDraft) -> dict[str, int]:
+    """Return the registers for the compliance of a joint, if all pages have the same unusual one."""
+    found = sorted({page.compliance[number] for page in used if number < len(page.compliance)})
+    if found in ([], [_USUAL_COMPLIANCE]):
+        return {}
+    if len(found) > 1 or found[0] not in _COMPLIANCES:
+        values = ", ".join(f"{one:g}" for one in found)
+        draft.remarks.append(
+            f"joint_{number}: compliance {values} of the pages; write `registers` of the joint"
+        )
+        return {}
+    return dict.fromkeys(("cw_compliance_slope", "ccw_compliance_slope"), 1 << int(found[0]))
 
 
 def _motion(
     page: MotionPage, ids: Sequence[int], starts: list[list[float]], draft: RobotDraft
 ) -> Iterator[str]:
     """Yield the lines of a page; `starts` are the poses from which it is reached."""
-    _, leaves, repeat, speed, _ = page.param
+    _, _, repeat, speed, _ = page.param
     if speed <= 0:
         raise refused(page.mark, f"page {page.name} has speed {speed:g}", "give it a speed above 0")
-    unusual = any(page.compliance[one] != _USUAL_COMPLIANCE for one in ids if one < len(page.compliance))
-    remarks = [f"its exit page {int(leaves)}; a motion ends after its last step"] * bool(leaves)
-    remarks += [f"compliance other than {_USUAL_COMPLIANCE}; write registers of the joints"] * unusual
+    remarks: list[str] = []
     yield f"      {page.name}:"
     yield from [f"        speed: {speed:g}"] * (speed != 1)
     yield from [f"        repeat: {int(repeat)}"] * (repeat > 1)
     yield from [f"        next: {one.name}" for one in (page.follower,) if one]
+    yield from [f"        exit: {one.name}" for one in (page.exit,) if one]
     yield "        steps:"
     for index, step in enumerate(page.steps, 1):
         moved = [one for one in ids if step[one] < _UNMOVED]

@@ -374,6 +374,9 @@ class Controller(ABC, Generic[P]):
     """Topics of the log that are written in the cycles that it marks: `/joint_states`."""
     keeps: ClassVar[bool] = False
     """True if the controller keeps a state from run to run with `Context.keep`."""
+    graceful: ClassVar[bool] = False
+    """True if `on_cancel` may complete a motion before it ends the goal. A second cancel then calls it again
+    to bring the joints to rest at once; otherwise it is refused."""
 
     def __init__(self, parameters: P) -> None:
         self.parameters = parameters
@@ -409,7 +412,10 @@ class Controller(ABC, Generic[P]):
 
     @classmethod
     def motions(cls, parameters: P) -> Mapping[str, float]:
-        """Return the duration of each motion that its goal `play` can play, `{"motion": name}`; s by name."""
+        """Return the duration of each motion that its goal `play` can play, `{"motion": name}`; s by name.
+
+        It is infinite for a motion that is played until it is cancelled.
+        """
         return {}
 
     @classmethod

@@ -5,6 +5,7 @@ All plug-in code that a client can reach runs here, in the gateway's process, ne
 
 from __future__ import annotations
 
+import math
 import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -239,12 +240,16 @@ class Preparation:
         offer = self.plugins.controllers.get(plan.type)
         return sorted(offer.controller.Goals) if offer else []
 
-    def motions(self, plan: ControllerPlan) -> dict[str, float]:
-        """Return a controller's motions with durations, s, by name; empty when the plug-in's code fails."""
+    def motions(self, plan: ControllerPlan) -> dict[str, float | None]:
+        """Return a controller's motions with durations, s, by name; None: until it is cancelled.
+
+        Empty when the plug-in's code fails.
+        """
         try:
             known = self.parse_controller(plan)
             with bounded(plan.name):
-                return dict(known.controller.motions(known.parameters))
+                found = known.controller.motions(known.parameters)
+                return {name: seconds if math.isfinite(seconds) else None for name, seconds in found.items()}
         # The plug-in's code failed; other controllers are still shown.
         except (Exception, SystemExit):
             return {}

@@ -101,7 +101,7 @@ def send(
 def cancel(goal: str = "", /, *, wait: WaitFlag = False, chosen: RobotChoice = ONLY_ONE) -> int:
     """Cancel goals of a running robot.
 
-    Their controllers bring the joints to rest.
+    Their controllers bring the joints to rest. A motion with an exit plays it; a second cancel stops it.
 
     Parameters
     ----------
@@ -233,8 +233,16 @@ def _ended(robot: RemoteRobot, numbers: Sequence[int], motion: str, *, hidden: b
 def cancel_goals(robot: RemoteRobot, numbers: Sequence[int]) -> list[GoalState]:
     """Cancel goals, wait until their joints are at rest or REST_S, and return their final states.
 
-    Errors are printed; a goal without a result is not returned.
+    Ctrl-C during the wait cancels them again, which stops motions that are playing their exits. Errors are
+    printed; a goal without a result is not returned.
     """
+    try:
+        return _cancel_once(robot, numbers)
+    except KeyboardInterrupt:
+        return _cancel_once(robot, numbers)
+
+
+def _cancel_once(robot: RemoteRobot, numbers: Sequence[int]) -> list[GoalState]:
     for number in numbers:
         try:
             robot.cancel(number)

@@ -41,7 +41,9 @@ class Playable(NamedTuple):
     controllers: Sequence[str]
     joints: Sequence[str]
     seconds: float | None
-    """Duration at speed 1, from the first pose on, s; None when the motion file cannot be read."""
+    """Duration at speed 1, from the first pose on, s; None for a motion that is played until it is cancelled,
+    and for a motion file that cannot be read.
+    """
     file: str = ""
     """Path of the motion file; empty when a controller has the motion."""
 
@@ -151,10 +153,10 @@ def _found(robot: RemoteRobot, name: str) -> MotionSource:
     )
 
 
-def _players(info: Mapping[str, object]) -> dict[str, Mapping[str, float]]:
+def _players(info: Mapping[str, object]) -> dict[str, Mapping[str, float | None]]:
     """Return controller -> motion -> duration, s, for the motions that controllers have."""
     rows = cast("Sequence[Mapping[str, object]]", info["controllers"])
-    return {str(row["name"]): cast("Mapping[str, float]", row["motions"]) for row in rows}
+    return {str(row["name"]): cast("Mapping[str, float | None]", row["motions"]) for row in rows}
 
 
 def _files(info: Mapping[str, object]) -> list[Path]:

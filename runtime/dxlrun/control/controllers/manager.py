@@ -395,9 +395,9 @@ class Manager:
             goal = self._goals.found(number)
         if isinstance(goal, Refusal):
             return goal
-        if goal.cancelling:
-            return Refusal(Code.CANCELLED_ALREADY, {"goal": goal.number, "controller": goal.controller})
         managed = self._named[goal.controller]
+        if goal.cancelling and not managed.controller.graceful:
+            return Refusal(Code.CANCELLED_ALREADY, {"goal": goal.number, "controller": goal.controller})
         return self._attempt(managed, managed.cancel_goal, goal)
 
     def play_motion(

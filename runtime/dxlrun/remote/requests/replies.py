@@ -40,8 +40,8 @@ class ControllerInfo(msgspec.Struct, frozen=True):
     """Command that clients can send -> JSON Schema of its fields."""
     goals: tuple[str, ...]
     """Names of the commands in `takes` that are goals: they run for a time and report a result."""
-    motions: dict[str, float]
-    """Name of each motion that the controller can play -> its duration, s."""
+    motions: dict[str, float | None]
+    """Name of each motion that the controller can play -> its duration, s; null: until it is cancelled."""
 
 
 @dataclass(frozen=True)
