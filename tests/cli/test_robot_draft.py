@@ -63,9 +63,17 @@ def test_rate_fits_the_bus(tmp_path: Path) -> None:
     assert 250_000_000 < plan.buses[0].budget.total_ns <= 500_000_000
 
 
-@pytest.mark.parametrize("other", [found(2, "XM430-W350", rate=57_600), found(2, "AX-12A", 1.0)])
-def test_what_cannot_be_one_bus_is_refused_with_the_way_out(tmp_path: Path, other: FoundServo) -> None:
-    with pytest.raises(ServoFault, match=r"these servos cannot share a bus.*ID 2.*dxlrun servo /dev/ttyUSB0"):
+@pytest.mark.parametrize(
+    ("other", "fix"),
+    [
+        (found(2, "XM430-W350", rate=57_600), "dxlrun servo /dev/ttyUSB0"),
+        (found(2, "AX-12A", 1.0), "an adapter of its own: a servo of Protocol 1.0 executes"),
+    ],
+)
+def test_what_cannot_be_one_bus_is_refused_with_the_way_out(
+    tmp_path: Path, other: FoundServo, fix: str
+) -> None:
+    with pytest.raises(ServoFault, match=rf"these servos cannot share a bus.*ID 2.*{fix}"):
         draft_file(tmp_path / "two.yaml", PORT, [found(1, "XM430-W350"), other], 0)
     assert not list(tmp_path.iterdir())
     with pytest.raises(ServoFault, match="no servo of a known model"):

@@ -5,15 +5,22 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
+import pytest
 import yaml
 from tests.kit.answers import result_of
 from tests.kit.commands import Dxlrun
+from tests.kit.mixed_line import MixedBus
+from tests.kit.rigs import VirtualLine
 
+from dxlrun.cli.tools.scan import scan
+from dxlrun.dynamixel.tools import tool_line
 from dxlrun.log.log_reader import read_log
 from dxlsim.simulation_plan import BusConfig, ServoConfig
+from dxlsim.virtual_ports import VirtualPorts
 from dxlwire.packets import PacketKind
 
 NARROW = ("--baud", "1000000", "--ids", "1-4")
@@ -76,6 +83,22 @@ def test_both_protocols_are_looked_at_and_reported_as_json(dxlrun: Dxlrun, simul
     packets = b"".join(heard(finish)).split(b"\xff\xff")[1:]  # not by entry: a delayed bus hears two at once
     assert {data[2] for data in packets if data[0] != 0xFD} == {1, 2}
     assert sum(data[0] == 0xFD for data in packets) >= 4
+
+
+def test_both_protocols_are_found_on_one_line_with_a_warning(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A status of the XL430, at -16 ticks, is the beginning of 258 bytes for the AX-12A."""
+    line: Any = VirtualLine(rate=1_000_000)
+    line.bus = MixedBus([ServoConfig(1, "AX-12A", 2.0), ServoConfig(2, "XL430-W250", 2.0)], line.ledger)
+    line.ports, line.other_rates = VirtualPorts(line.clock, [line.bus]), {}
+    line.bus.servo(2).registers.show_live({"present_position": lambda: -16})
+    monkeypatch.setattr(tool_line, "TunablePort", lambda path: nullcontext(line))
+    assert scan("/dev/ttyUSB0", baud=(1_000_000,), ids="1-8", as_json=True) == 0
+    said = capsys.readouterr().out
+    found = [(servo["servo_id"], servo["protocol"]) for servo in result_of(said)["servos"]]
+    assert found == [(2, 2.0), (1, 1.0)]
+    assert "/dev/ttyUSB0 has servos of both protocols: give each protocol an adapter of its own" in said
 
 
 def test_no_servo_at_all_is_exit_code_one(dxlrun: Dxlrun, simulated_line: Line) -> None:

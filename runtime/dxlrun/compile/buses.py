@@ -25,6 +25,7 @@ from dxlwire.modes import Mode
 from dxlwire.plan.bus_watchdog import LEAST_PERIODS, MOST_TICKS, UNIT_NS, has_watchdog
 from dxlwire.plan.planning import Wiring, bus_plan
 from dxlwire.plan.reads import slow_items
+from dxlwire.wire.dialect import ONE_PROTOCOL
 
 FAST_LATENCY_NS = 1_000_000  # shortest latency timer of an FTDI adapter (protocol.md, Time budget)
 _COMFORTABLE = 0.9
@@ -114,10 +115,11 @@ def _own_ports(file: RobotFile) -> None:
     for name, bus in file.robot.buses.items():
         owner = owners.setdefault(bus.port, name)
         if owner != name and bus.port != SIMULATED:
+            alike = bus.protocol == file.robot.buses[owner].protocol
             file.error(
                 file.at("buses", name, "port"),
                 f"port {bus.port} of bus {name} belongs to bus {owner} already",
-                "one port is one bus",
+                "one port is one bus" if alike else f"give {name} an adapter of its own: {ONE_PROTOCOL}",
             )
 
 

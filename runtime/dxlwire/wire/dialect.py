@@ -7,9 +7,16 @@ from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Protocol
 
+from dxlwire.exceptions import help_link
 from dxlwire.packets import Bytes
 from dxlwire.transaction import Status
 from dxlwire.wire import protocol1, protocol2
+
+ONE_PROTOCOL = (
+    "a servo of Protocol 1.0 executes bytes of Protocol 2.0 replies; "
+    f"{help_link('two-protocols-on-one-adapter')}"
+)
+"""Reason why a line has one protocol, for messages (protocol.md, Line)."""
 
 
 class Dialect(Protocol):

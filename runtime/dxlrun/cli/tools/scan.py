@@ -146,6 +146,7 @@ def _show(port: str, scanned: ScanResult, rates: Mapping[int, int], *, narrowed:
     it.
     """
     from dxlwire.port.adapters import warnings_for
+    from dxlwire.wire.dialect import ONE_PROTOCOL
 
     nothing = (
         f"no servo answers at {port}; check power, cable and port (`dxlrun doctor` lists the adapters)"
@@ -163,6 +164,10 @@ def _show(port: str, scanned: ScanResult, rates: Mapping[int, int], *, narrowed:
         for servo in scanned.servos
         for remark in servo.remarks
     ]
+    if len({servo.protocol for servo in scanned.servos}) > 1:
+        warnings.append(
+            f"{port} has servos of both protocols: give each protocol an adapter of its own: {ONE_PROTOCOL}"
+        )
     if as_json:
         found = {"port": port, "servos": scanned.servos, "left_out": scanned.left_out}
         show_json(found, code=len(errors), errors=errors, warnings=warnings)
@@ -230,6 +235,8 @@ def check_draft(path: Path) -> None:
 
 def draft(stem: str, port: str, servos: Sequence[FoundServo], latency_ns: int) -> str:
     """Return the text of a drafted robot file, compiled as a test; raises ServoFault as `draft_file`."""
+    from dxlwire.wire.dialect import ONE_PROTOCOL
+
     known = [servo for servo in servos if servo.model]
     if not any(not each.device for each in known):
         raise ServoFault("no servo of a known model was found, so no robot file was written")
@@ -239,10 +246,10 @@ def draft(stem: str, port: str, servos: Sequence[FoundServo], latency_ns: int) -
             f"Protocol {protocol} at {rate} bit/s: ID {_ids(known, protocol, rate)}"
             for protocol, rate in lines
         ]
-        raise ServoFault(
-            f"these servos cannot share a bus ({'; '.join(found)}); give them one baud rate by "
-            f"`dxlrun servo {port} ID baud RATE`, or scan each kind alone by --protocol and --baud"
-        )
+        fix = f"give them one baud rate by `dxlrun servo {port} ID baud RATE`, or scan each alone by --baud"
+        if lines[0][0] != lines[-1][0]:
+            fix = f"scan each by --protocol, and give it an adapter of its own: {ONE_PROTOCOL}"
+        raise ServoFault(f"these servos cannot share a bus ({'; '.join(found)}); {fix}")
     from dxlrun.compile.robot_compiler import compile_files
 
     text = _text(stem, port, known, latency_ns, rate=1)

@@ -20,6 +20,7 @@ from dxlsim.motor_model import MotorModel
 from dxlwire.bus_plan import BusPlan, RegisterValue
 from dxlwire.control_table import ControlTable, find_table, perhaps_meant, protocols_of
 from dxlwire.plan.mode_plan import mode_plans
+from dxlwire.wire.dialect import ONE_PROTOCOL
 
 _USUAL = {1.0: "AX-12A", 2.0: "XM430-W350"}  # assumed model if none is known, by protocol
 MANY_TURNS = {1.0: 7, 2.0: 256}
@@ -122,7 +123,7 @@ def compile_servos(file: RobotFile, models: Mapping[str, str], motors: Motors) -
         model = servo.model if servo.model != AUTO else models.get(servo.name)
         if model is None:
             model = _assumed_model(file, servo, described)
-        table = _table(file, servo, model)
+        table = _table(file, servo, model, described)
         if table is None:
             continue
         if not servo.continuous:
@@ -207,7 +208,9 @@ def _assumed_model(file: RobotFile, servo: DescribedServo, others: list[Describe
     return model
 
 
-def _table(file: RobotFile, servo: DescribedServo, model: str) -> ControlTable | None:
+def _table(
+    file: RobotFile, servo: DescribedServo, model: str, others: Iterable[DescribedServo]
+) -> ControlTable | None:
     mark, name = servo.mark(file.marks, "model"), servo.title
     bus = file.robot.buses.get(servo.bus)
     protocol = None if bus is None else bus.protocol
@@ -219,10 +222,13 @@ def _table(file: RobotFile, servo: DescribedServo, model: str) -> ControlTable |
         file.error(mark, f"model {model} of {name} is unknown", perhaps_meant(model, protocol))
         return None
     if bus is not None:
+        fix = f"put {name} on a bus with Protocol {protocols[0]}"
+        if any(bus.protocol in protocols_of(other.model) for other in others if other.bus == servo.bus):
+            fix = f"{fix} and an adapter of its own: {ONE_PROTOCOL}"
         file.error(
             mark,
             f"{model} of {name} has Protocol {protocols[0]}, but bus {servo.bus} has Protocol {bus.protocol}",
-            f"put {name} on a bus with Protocol {protocols[0]}",
+            fix,
         )
     return find_table(model, protocols[0])
 

@@ -33,6 +33,10 @@ broadcastPing).
 LATE_NS = 20_000_000  # listening time after the last request at a rate, for replies that the adapter delays
 LATE_OF_FEW_NS = 100_000_000
 """Listening time (ns) like LATE_NS, but if few IDs are pinged: then the machine may be late, too."""
+DISCARD_NS = 110_000_000
+"""Listening time (ns) before pings of Protocol 1.0: its servos take bytes of Protocol 2.0 for the beginning
+of a packet, and discard it after a pause of 100 ms (protocol.md, Line).
+"""
 FEW = 20  # up to this many IDs, single pings are faster than a broadcast
 _USUAL = (1_000_000, 57_600, 115_200)
 _IDENTITY_LENGTH = 3
@@ -156,7 +160,8 @@ def _knock(tool: ToolLine, servo_id: int, tries: int) -> Program[bool]:
 
 def _search(tool: ToolLine, ids: Sequence[int], beat: Callable[[float], None]) -> Program[list[FoundServo]]:
     line, heard = tool.line, tool.heard
-    yield listen_transaction(LATE_NS)  # replies that are still to come at the previous rate
+    # Replies of the previous rate are still to come.
+    yield listen_transaction(DISCARD_NS if line.dialect.PROTOCOL == 1.0 else LATE_NS)
     heard.clear_records()
     # Only Protocol 2.0, whose ping replies contain the model number, has a broadcast ping with slots.
     if line.dialect.PING_LENGTH >= _IDENTITY_LENGTH and len(ids) > FEW:
