@@ -14,6 +14,8 @@ from dxlwire.joint_unit import ROTARY, JointUnit
 from dxlwire.modes import Mode
 from dxlwire.transaction import Transaction
 
+SIMULATED = "sim"
+"""Port of a simulated bus."""
 SIGN = 0x400
 """Direction bit of items with sign and magnitude, bit 10: clockwise (e-Manual AX-12A, Moving Speed (32),
 Present Speed (38), Present Load (40))."""

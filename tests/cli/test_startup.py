@@ -135,3 +135,10 @@ def test_monitors_bring_no_compiler_into_the_process_of_the_loop() -> None:
     imported = set(printed(LOOP))
     assert beneath(imported, "dxlrun.compile") == {"dxlrun.compile", "dxlrun.compile.contribution"}
     assert beneath(imported, "yaml", "rich", "cyclopts", "dxlrun.cli", "dxlrun.remote.gateway") == set()
+
+
+def test_guardian_needs_neither_numpy_nor_pydantic() -> None:
+    """Each run waits until it is there."""
+    imported = set(printed("import json, sys, dxlrun.run.guardian; print(json.dumps([*sys.modules]))"))
+    assert "dxlrun.run.guardian" in imported
+    assert beneath(imported, "numpy", "pydantic", "yaml", "rich", "cyclopts") == set()

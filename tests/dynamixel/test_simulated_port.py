@@ -14,9 +14,9 @@ from dxlrun.channels.heartbeat import (
     SimulationProgress,
     create_progress,
 )
-from dxlrun.description.bus import SIMULATED
 from dxlrun.run.guardian import make_ports
 from dxlsim.serving.host import ENDLESS_NS
+from dxlwire.bus_plan import SIMULATED
 from dxlwire.port.ports import LONGEST_STALL_NS, SerialPort, SimulatedPort, StallCounter
 
 MS = 1_000_000

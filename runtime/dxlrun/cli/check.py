@@ -124,8 +124,8 @@ def _look(result: CompiledRobot, packets: BusesLog) -> InspectionResult:
 
     Raises InputError when all buses are simulated.
     """
-    from dxlrun.description.bus import SIMULATED
     from dxlrun.dynamixel.tools.inspection import inspect_buses
+    from dxlwire.bus_plan import SIMULATED
 
     buses = [bus for bus in result.plan.buses if bus.port != SIMULATED]
     if not buses:

@@ -14,11 +14,11 @@ from dxlrun.compile.joints.compiled_servos import CompiledServo, SettingsStage
 from dxlrun.compile.joints.described_servos import described_servos, first_joints, used_features
 from dxlrun.compile.joints.limits import Interval, limits_of
 from dxlrun.compile.problems import RobotFile
-from dxlrun.description.bus import HIGHEST_BAUD_RATE, SIMULATED
+from dxlrun.description.bus import HIGHEST_BAUD_RATE
 from dxlrun.description.reading import Description
 from dxlrun.errors import help_link, suggestion
 from dxlrun.features import stages
-from dxlwire.bus_plan import Budget, BusPlan
+from dxlwire.bus_plan import SIMULATED, Budget, BusPlan
 from dxlwire.control_table import ControlTable, find_table
 from dxlwire.control_table.device_table import DeviceTable
 from dxlwire.modes import Mode

@@ -33,7 +33,6 @@ from dxlrun.compile.policies import compile_policies
 from dxlrun.compile.problems import RobotFile
 from dxlrun.compile.simulation import compile_simulation
 from dxlrun.control.controllers.plugin_loading import load_plugins
-from dxlrun.description.bus import SIMULATED
 from dxlrun.description.joints.groups import NO_GROUPS, Groups
 from dxlrun.description.joints.joint_forms import Joint
 from dxlrun.description.reading import Description, Replacement, read_robot
@@ -46,7 +45,7 @@ from dxlrun.plan.loop_plan import MOST_SHARE, LoopPlan, SchedulerPlan
 from dxlrun.plan.mechanics_plan import MechanicsPlan
 from dxlrun.plan.recording_plan import RecordingPlan
 from dxlrun.plan.robot_plan import MotionPart, Plan, SimulationPlan
-from dxlwire.bus_plan import BusPlan
+from dxlwire.bus_plan import SIMULATED, BusPlan
 
 if TYPE_CHECKING:
     from dxlrun.compile.check_report import Row

@@ -16,7 +16,7 @@ from dxlrun.compile.joints.compiled_urdf import TYPES
 from dxlrun.compile.joints.motors import Motors
 from dxlrun.compile.problems import RobotFile
 from dxlrun.control.sampled_sources import planned_processes
-from dxlrun.description.bus import SIMULATED, Bus
+from dxlrun.description.bus import Bus
 from dxlrun.errors import InputError
 from dxlrun.plan.robot_plan import Plan, SimulationPlan
 from dxlsim.motor_model import MotorLoad
@@ -34,7 +34,7 @@ from dxlsim.simulation_plan import (
     SimulationConfig,
     UrdfBodies,
 )
-from dxlwire.bus_plan import BusPlan
+from dxlwire.bus_plan import SIMULATED, BusPlan
 from dxlwire.control_table import added_control_tables
 from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
 

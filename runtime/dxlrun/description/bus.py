@@ -10,10 +10,10 @@ from pydantic import AfterValidator, Field
 
 from dxlrun.description.base_form import Form, ItemName, key, validation_error
 from dxlrun.description.units import AutoDuration, Duration, Rate
+from dxlwire.bus_plan import SIMULATED
 
 HIGHEST_BAUD_RATE = 10_500_000
 """Highest baud rate of any servo, bit/s: that of PRO, P and Y."""
-SIMULATED = "sim"  # port of a simulated bus
 _HIGHEST_ID_OF_PROTOCOL_2 = 252  # 0xFD is in the header of each packet (e-Manual, Protocol 2.0, Packet ID)
 _LONGEST_TIMER_NS = 255_000_000  # The latency timer of an FTDI chip is one byte, ms (FTDI AN232B-04)
 

@@ -39,7 +39,6 @@ from dxlrun.channels.logged_packets import PacketBatch, salvage
 from dxlrun.channels.ring import RingReader, RingWriter
 from dxlrun.channels.shared_memory import mapped
 from dxlrun.control import realtime_grants
-from dxlrun.description.bus import SIMULATED
 from dxlrun.dynamixel.bus_part import SafeEnd
 from dxlrun.dynamixel.servo.torque_off import limp, stand
 from dxlrun.errors import PortError
@@ -48,7 +47,7 @@ from dxlrun.plan.policy_plan import TORQUE_STAYS, Last
 from dxlrun.process_table import describe_run
 from dxlrun.run import texts
 from dxlrun.run.process_watch import Duty, SignsOfLife, WatchedProcess, duty_of, loop_timeout_ns
-from dxlwire.bus_plan import BusPlan
+from dxlwire.bus_plan import SIMULATED, BusPlan
 from dxlwire.clock import MonotonicClock
 from dxlwire.exchange.bus_engine import Lines
 from dxlwire.port.ports import SerialPort, SerialPorts, SimulatedPort, StallCounter

@@ -22,7 +22,6 @@ from dxlrun.channels.topic_messages import LONGEST_RECORD, message_capacity, usu
 from dxlrun.compile.simulation import sensed_bodies, simulation_of
 from dxlrun.control.realtime_grants import Grant, guardian_priority, raise_share
 from dxlrun.control.sampled_sources import PlannedProcess, planned_processes
-from dxlrun.description.bus import SIMULATED
 from dxlrun.log.schemas import LogClosed, LogHeader, RecorderJob
 from dxlrun.plan.robot_plan import Plan, to_json
 from dxlrun.process_table import KIND
@@ -32,6 +31,7 @@ from dxlrun.run.loop_process import LoopOutcome
 from dxlrun.run.simulation_front import first_message, start_simulation
 from dxlrun.run.source_process import SourceJob
 from dxlsim.messages import SimulationJob, SimulationMessage
+from dxlwire.bus_plan import SIMULATED
 
 SourceMessage = Ready | Failed
 RecorderMessage = Ready | Draining | Failed | LogClosed

@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from dxlrun.control.controllers.plugin_loading import PlugIns as PlugIns
     from dxlrun.control.controllers.plugin_loading import load_plugins as load_plugins
     from dxlrun.control.controllers.single_files import published_by as published_by
-    from dxlrun.description.bus import SIMULATED as SIMULATED
     from dxlrun.description.document import read_file as read_file
     from dxlrun.description.including import Source as Source
     from dxlrun.description.including import read_sources as read_sources
@@ -38,5 +37,6 @@ if TYPE_CHECKING:
     from dxlrun.description.reading import Description as Description
     from dxlrun.description.reading import Replacement as Replacement
     from dxlrun.description.reading import read_robot as read_robot
+    from dxlwire.bus_plan import SIMULATED as SIMULATED
 else:
     __getattr__, __dir__ = lazy_face(__name__, __file__)

@@ -15,13 +15,12 @@ from typing import NamedTuple
 
 import msgspec
 
-from dxlrun.description.bus import SIMULATED
 from dxlrun.dynamixel import texts
 from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.remedies import CHECK, choose_remedy
 from dxlrun.dynamixel.servo.item_access import Access, first_reach
 from dxlrun.dynamixel.servo.registers import format_item, tripped
-from dxlwire.bus_plan import BusPlan, ServoPlan
+from dxlwire.bus_plan import SIMULATED, BusPlan, ServoPlan
 from dxlwire.control_table import (
     ControlItem,
     FoundDeviation,

@@ -11,13 +11,13 @@ from dxlrun.compile.controllers import report_entry
 from dxlrun.compile.problems import RobotFile
 from dxlrun.control.controllers.offers import DriverOffer
 from dxlrun.control.controllers.plugin_loading import PlugIns
-from dxlrun.description.bus import SIMULATED
 from dxlrun.errors import Mark, suggestion
 from dxlrun.features.sensors import form
 from dxlrun.features.sensors.form import SensorEntry
 from dxlrun.features.sensors.offer import is_units, names_breach
 from dxlrun.features.sensors.plan import SensorPlan, encode_sensors
 from dxlrun.plan.loop_plan import SourcePlan
+from dxlwire.bus_plan import SIMULATED
 
 _LEAST_TIMEOUT_NS = 50_000_000  # a process without real-time priority may wait so long for a processor
 # default timeout in periods of the sensor; a single late sample must not make it invalid
