@@ -45,7 +45,8 @@ from dxlwire.modes import Mode
 MS = 1_000_000
 TURN = math.radians(100)
 TICK = math.tau / 4096
-BEGUN_MS, LOST_MS, TURNED_MS = 300, 1000, 1150
+BEGUN_MS, LOST_MS, TURNED_MS = 100, 800, 950
+FOLLOWED_MS = 500  # Long enough for the slowest joint
 STEP_MS = 20  # Between two looks at the shafts
 WITHOUT_JOINTS = {
     "battery_state_broadcaster", "device_command_controller", "fall_reflex", "imu_sensor_broadcaster",
@@ -293,11 +294,11 @@ class Story:
             turn_by_hand(self.servos[other], self.put[other])
 
     def watch(self, until: Callable[[], bool], then: Callable[[], object]) -> None:
-        """Watch the shafts from now on; when it is time, let clients command again, for a second."""
+        """Watch the shafts from now on; when it is time, let clients command again."""
         if self.commanded_ms == math.inf and until():
             self.commanded_ms = self.now_ms
             then()
-        elif self.now_ms > self.commanded_ms + 800:
+        elif self.now_ms > self.commanded_ms + FOLLOWED_MS:
             self.robot.stop.request()
             return
         angles = [self.servos[name].shaft.angle for name in self.names]
@@ -412,14 +413,14 @@ def _(story: Story) -> None:
 
 @way("return after a brown-out")
 def _(story: Story) -> None:
-    faults(story, "brownout at=1000ms for=300ms")
+    faults(story, f"brownout at={LOST_MS}ms for=300ms")
     turned(story)
 
 
 @way("return with the port", ("plain", "protocol 1"))
 def _(story: Story) -> None:
-    faults(story, "brownout at=1000ms for=300ms")
-    faults(story, "unplug at=1000ms for=400ms")
+    faults(story, f"brownout at={LOST_MS}ms for=300ms")
+    faults(story, f"unplug at={LOST_MS}ms for=400ms")
     turned(story)
 
 
@@ -442,7 +443,7 @@ def _(story: Story) -> None:
     policy="limp",
 )
 def _(story: Story) -> None:
-    faults(story, "brownout at=1000ms for=300ms")
+    faults(story, f"brownout at={LOST_MS}ms for=300ms")
     turned(story)
 
     def request() -> None:
@@ -458,7 +459,7 @@ def _(story: Story) -> None:
 @way("return in a pause", ("plain",))
 def _(story: Story) -> None:
     story.at(LOST_MS - 50, lambda: story.ask("pause"))
-    faults(story, "brownout at=1000ms for=300ms")
+    faults(story, f"brownout at={LOST_MS}ms for=300ms")
     turned(story, watch=False)
 
     def go_on() -> None:
