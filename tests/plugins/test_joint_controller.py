@@ -33,7 +33,7 @@ WAVE = (SHORT / "wave.py").read_text()
 LAW = "self.start + self.amplitude * np.sin(2 * np.pi * self.frequency * time)"
 ROBOT = """\
 name: short
-loop: {rate: 50}
+loop: {rate: 50, tolerated_skips: 100 %}
 buses: {main: {port: sim, protocol: 2.0, baud_rate: 1_000_000}}
 joint_defaults: {bus: main, model: XM430-W350, reference: 180 deg, direction: 1}
 joints: {pan: {id: 1}, tilt: {id: 2}}
