@@ -35,7 +35,6 @@ echo "== tests"
 ../venv/bin/python -m pytest -q -n 0 -p no:cacheprovider $TESTS
 """
 PACKAGES = (
-    "dynamixel-sdk",
     "hypothesis",
     "jsonschema",
     "mcap-ros2-support",

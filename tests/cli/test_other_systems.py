@@ -1,4 +1,4 @@
-"""Windows and macOS: files are checked, logs read and replayed, robots run on virtual time; no more.
+"""Windows and macOS: files, logs and servos are read, servos set up, and robots run on virtual time; no more.
 
 A fresh interpreter runs a command line once as it is, so that the standard library and other packages are
 imported; then everything that only Linux has is taken away, dxlrun is imported again, and runs it again.
@@ -7,13 +7,22 @@ imported; then everything that only Linux has is taken away, dxlrun is imported 
 from __future__ import annotations
 
 import json
+import os
+import select
+import socket
 import subprocess
 import sys
+import threading
+from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
 import pytest
+from tests.kit.bus_process import opened, simulated_lines
 from tests.kit.commands import Dxlrun, Said
+
+from dxlsim.simulation_plan import BusConfig, ServoConfig
 
 pytestmark = pytest.mark.long
 
@@ -67,6 +76,7 @@ from dxlrun.cli import main
 
 print(json.dumps([run(words) for words in lines]))
 """
+SINGLE = str(ROOT / "robots/single_joint.yaml")
 WORK = {
     "check": ("check TORSO", "Policies"),
     "models": ("models", "\n"),
@@ -76,6 +86,10 @@ WORK = {
     "--version": ("--version", "\n"),
     "help": ("help check", "\n"),
     "virtual": ("TORSO --virtual --duration 1", "0 of 50 periods skipped"),
+    "scan": ("scan PORT --protocol 1 --baud 1000000 --ids 1-2 --log scan.mcap", "MX-64"),
+    "servo": ("servo PORT 1 set led 1 --protocol 1 --baud 1000000", "LED (25)"),
+    "online": (f"check {SINGLE} port:=PORT --online", "1 servo compared with the file, no differences"),
+    "log of scan": ("analyze scan.mcap", "`dxlrun scan socket://"),
 }
 """Commands that work, with words of their output."""
 REFUSED = {
@@ -87,8 +101,7 @@ REFUSED = {
     ),
 }
 WINDOWS = {
-    verb: (words, f"dxlrun: `dxlrun {verb}` needs Linux, and this is win32")
-    for verb, words in {"scan": "scan /dev/none", "list": "list", "watch": "watch"}.items()
+    verb: (verb, f"dxlrun: `dxlrun {verb}` needs Linux, and this is win32") for verb in ("list", "watch")
 }
 """Refused on Windows alone: macOS has what they need."""
 
@@ -110,16 +123,49 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return next((place / "logs").iterdir())
 
 
+@pytest.fixture(scope="module")
+def port(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """A servo at a URL of pyserial, which is a serial line on every system."""
+
+    def serve(line: int) -> None:
+        with suppress(OSError):  # until the server is closed
+            while host := server.accept()[0]:
+                with suppress(OSError), host:
+                    join(line, host)
+
+    def join(line: int, host: socket.socket) -> None:
+        while ready := select.select([line, host], [], [])[0]:
+            if line in ready:
+                host.sendall(os.read(line, 4096))
+            elif not (data := host.recv(4096)):
+                return
+            else:
+                os.write(line, data)
+
+    servo = BusConfig("main", 1_000_000, (ServoConfig(1, "MX-64", 3.0, 0),))
+    with (
+        simulated_lines(tmp_path_factory.mktemp("servo")) as simulated_line,
+        opened(simulated_line(servo)[0]) as line,
+        socket.create_server(("127.0.0.1", 0)) as server,
+    ):
+        threading.Thread(target=serve, args=(line,), daemon=True).start()
+        yield f"socket://127.0.0.1:{server.getsockname()[1]}"
+
+
 @pytest.fixture(scope="module", params=["win32", "darwin"])
 def elsewhere(
-    request: pytest.FixtureRequest, log: Path, tmp_path_factory: pytest.TempPathFactory
+    request: pytest.FixtureRequest, log: Path, port: str, tmp_path_factory: pytest.TempPathFactory
 ) -> Elsewhere:
     """Run all commands as if on another system."""
     windows = request.param == "win32"
     place = tmp_path_factory.mktemp(request.param)
     lacking = {one: f"{LINUX.get(one, '')} {POSIX.get(one, '') if windows else ''}" for one in LINUX | POSIX}
     commands = WORK | REFUSED | (WINDOWS if windows else {})
-    lines = [words.replace("TORSO", TORSO).replace("LOG", str(log)).split() for words, _ in commands.values()]
+    given_for = {"TORSO": TORSO, "LOG": str(log), "PORT": port}
+    lines = [
+        [given_for.get(word, word) for word in words.replace("=PORT", f"={port}").split()]
+        for words, _ in commands.values()
+    ]
     given = json.dumps([request.param, lacking, MODULES if windows else (), lines])
     command = [sys.executable, "-c", ELSEWHERE, given]
     ran = subprocess.run(command, cwd=place, capture_output=True, text=True, check=True)
@@ -128,7 +174,7 @@ def elsewhere(
 
 
 @pytest.mark.parametrize("name", WORK)
-def test_what_needs_no_robot_works(elsewhere: Elsewhere, name: str) -> None:
+def test_what_needs_no_run_works(elsewhere: Elsewhere, name: str) -> None:
     ran = elsewhere.ran[name]
     assert ran.code == 0, ran.err
     assert WORK[name][1] in ran.out

@@ -1,16 +1,12 @@
 import math
 
 import pytest
-from tests.kit.rigs import make_plan
+from tests.kit.rigs import VirtualLine, make_plan
 
 from dxlrun.compile.robot_compiler import compile_files
 from dxlrun.dynamixel.tools.inspection import identify, read_models
 from dxlrun.errors import PortError
-from dxlsim.bus.ledger import Ledger
-from dxlsim.bus.simulated_bus import SimulatedBus
 from dxlsim.simulation_plan import BusConfig, ServoConfig
-from dxlsim.virtual_ports import VirtualPorts
-from dxlwire.clock import VirtualClock
 
 ROBOT = """
 name: arm
@@ -25,32 +21,26 @@ controllers:
 """
 
 
-class Line:
-    """Simulated lines, and what they heard."""
-
-    def __init__(self, *buses):
-        self.clock, self.ledger = VirtualClock(1_000_000), Ledger()
-        self.buses = [SimulatedBus(bus, self.ledger, 0) for bus in buses]
-        self.ports = VirtualPorts(self.clock, self.buses)
-
-    def asked(self, plans, joints):
-        return identify(plans, joints, self.ports, self.clock)
-
-
 def servos(*models):
     return tuple(ServoConfig(number + 1, model, 2.0) for number, model in enumerate(models))
 
 
+def line_of(*models, protocol=1.0):
+    return VirtualLine(*servos(*models), protocol=protocol, rate=1_000_000)
+
+
+def asked(plans, joints, *lines):
+    lines = dict(zip([plan.name for plan in plans], lines, strict=True))
+    return identify(plans, joints, opened=lambda plan: lines[plan.name])
+
+
 def test_every_servo_says_what_it_is_on_both_protocols():
-    line = Line(
-        BusConfig("head", 1_000_000, servos("AX-12A", "MX-64")),
-        BusConfig("arm", 1_000_000, servos("XM430-W350", "XL-320", "MX-64"), 2.0),
-    )
+    lines = line_of("AX-12A", "MX-64"), line_of("XM430-W350", "XL-320", "MX-64", protocol=2.0)
     plans = [
         make_plan((1, 2), name="head", joints=("a", "b")),
         make_plan((1, 2, 3), name="arm", protocol=2.0, model="XM430-W350", joints=("c", "d", "e")),
     ]
-    found = line.asked(plans, "abcde")
+    found = asked(plans, "abcde", *lines)
     assert {joint: one.model for joint, one in found.items()} == {
         "a": "AX-12A",
         "b": "MX-64",
@@ -59,33 +49,33 @@ def test_every_servo_says_what_it_is_on_both_protocols():
         "e": "MX-64",
     }
     assert [one.problem for one in found.values()] == [""] * 5
-    heard = [entry.data for entry in line.ledger.entries if entry.direction == "in"]
+    heard = [data for line in lines for data in line.heard]
     assert {data[4] if data[2] != 0xFD else data[7] for data in heard} == {1, 2}  # pings and reads alone
 
 
 def test_only_who_is_asked_for_is_asked():
-    line = Line(BusConfig("arm", 1_000_000, servos("AX-12A", "AX-18A")))
-    found = line.asked([make_plan((1, 2), name="arm", joints=("a", "b"))], ["b"])
+    line = line_of("AX-12A", "AX-18A")
+    found = asked([make_plan((1, 2), name="arm", joints=("a", "b"))], ["b"], line)
     assert list(found) == ["b"]
     assert found["b"].model == "AX-18A"
-    assert all(e.data[2] == 2 for e in line.ledger.entries if e.direction == "in")
+    assert all(data[2] == 2 for data in line.heard)
 
 
 def test_a_silent_servo_and_an_unknown_one_are_named():
-    line = Line(BusConfig("arm", 1_000_000, servos("AX-12A", "AX-12A")))
-    line.buses[0].servo(1).silence()
-    line.buses[0].servo(2).poke("model_number", 999)
-    found = line.asked([make_plan((1, 2), name="arm", joints=("a", "b"))], "ab")
+    line = line_of("AX-12A", "AX-12A")
+    line.bus.servo(1).silence()
+    line.bus.servo(2).poke("model_number", 999)
+    found = asked([make_plan((1, 2), name="arm", joints=("a", "b"))], "ab", line)
     assert "a (ID 1 on bus arm) does not answer at 1000000 bit/s" in found["a"].problem
     assert "b (ID 2 on bus arm) has model number 999" in found["b"].problem
     assert [one.model for one in found.values()] == ["", ""]
 
 
 def test_a_line_that_is_gone():
-    line = Line(BusConfig("arm", 1_000_000, servos("AX-12A")))
+    line = line_of("AX-12A")
     line.ports.ports[0].unplug()
     with pytest.raises(PortError):
-        line.asked([make_plan((1,), name="arm", joints=("a",))], "a")
+        asked([make_plan((1,), name="arm", joints=("a",))], "a", line)
 
 
 def test_a_robot_file_is_compiled_with_what_the_servo_says(simulated_line, tmp_path):

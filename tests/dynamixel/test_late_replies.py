@@ -21,7 +21,7 @@ from tests.kit.campaigns import campaign
 from tests.kit.line_faults import STALLED, disturb_replies
 from tests.kit.rigs import VirtualLine, make_plan, make_rig, start_rig
 
-from dxlrun.dynamixel.tools.inspection import NOWHERE, _look, _run, compare_servos, identify
+from dxlrun.dynamixel.tools.inspection import compare_servos, identify, inspect_buses
 from dxlrun.dynamixel.tools.one_servo import OneServo
 from dxlrun.dynamixel.tools.scanning import Search, find_servo, scan
 from dxlrun.dynamixel.tools.tool_line import ToolLine
@@ -127,14 +127,11 @@ def look_again(protocol: float, faults: Faults) -> tuple[set[str], int]:
 
 
 def inspect_online(protocol: float, faults: Faults) -> tuple[set[str], int]:
-    rig = make_rig(plan_of(protocol))
-    make_odd(rig.buses[0], protocol)
-    replies = disturb_replies(rig.buses[0], 1, faults)
-    found = {
-        f"{one.joint} {one.model}: {one.problem}"
-        for one in identify(rig.plans, ["main_1_joint"], rig.ports, rig.clock).values()
-    }
-    (looked,) = _run([_look(rig.plans[0], {})], rig.plans, rig.ports, rig.clock, NOWHERE)
+    plan, (line, _) = plan_of(protocol), tool_of(protocol)
+    replies = disturb_replies(line.bus, 1, faults)
+    identities = identify([plan], ["main_1_joint"], opened=lambda _: line).values()
+    found = {f"{one.joint} {one.model}: {one.problem}" for one in identities}
+    looked = inspect_buses([plan], opened=lambda _: line)
     rows = {f"{row.item} {row.found}" for row in looked.registers if row.found is not None}
     return reported([*found, *rows, *looked.problems, *looked.remarks]), replies()
 

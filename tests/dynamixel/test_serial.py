@@ -17,7 +17,7 @@ import pytest
 import dxlrun
 from dxlrun.channels.child_processes import memory_file
 from dxlrun.compile.robot_compiler import compile_files
-from dxlrun.dynamixel.tools.tool_line import TunablePort
+from dxlrun.dynamixel.tools.tool_port import TunablePort
 from dxlrun.errors import PortError, help_link
 from dxlrun.plan.robot_plan import to_json
 from dxlrun.process_table import robot_of

@@ -9,7 +9,7 @@ import pytest
 from tests.kit.cases import TextCase, case_parameters, read_head
 from tests.kit.dialogues import Dialogue, check_dialogue
 
-from dxlrun.dynamixel.tools.tool_line import TunablePort
+from dxlrun.dynamixel.tools.tool_port import TunablePort
 from dxlwire.port.serial_open import open_serial
 
 TEXT = Path(__file__).parent / "dialogues" / "calibrate.txt"

@@ -10,7 +10,6 @@ import termios
 import threading
 import time
 from collections.abc import Callable
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Self, cast
 
@@ -18,7 +17,7 @@ from tests.kit import awaited
 from tests.kit.rigs import VirtualLine
 
 from dxlrun import running
-from dxlrun.dynamixel.tools.tool_line import TunablePort
+from dxlrun.dynamixel.tools.tool_port import TunablePort
 from dxlsim.faults.fault import parse_fault
 from dxlsim.faults.script import FaultScript
 from dxlsim.simulation_plan import ServoConfig
@@ -26,19 +25,13 @@ from dxlsim.simulation_plan import ServoConfig
 LOOK_NS = 20_000_000
 
 
-class HandLine(VirtualLine, AbstractContextManager["HandLine"]):
+class HandLine(VirtualLine):
     """A line of simulated servos that a hand connects, disconnects and turns."""
 
     def __init__(self, *servos: ServoConfig, protocol: float = 2.0, rate: int = 57_600) -> None:
         super().__init__(*servos, protocol=protocol, rate=rate)
         self._faults = FaultScript([])
         self._faults.attach([self.bus])
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
 
     def open(self, path: str) -> TunablePort:
         """Be the port that a command opens."""

@@ -19,7 +19,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from random import Random
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import pytest
@@ -254,10 +254,24 @@ class VirtualLine:
         self.bus = SimulatedBus(config, self.ledger, 0)
         self.ports = VirtualPorts(self.clock, [self.bus])
 
+    def receive_bytes(self, until_ns: int) -> bytes:
+        self.ports.wait_for_bytes(until_ns)
+        buffer = memoryview(bytearray(4096))
+        return bytes(buffer[: self.ports.ports[0].read_into(buffer)])
+
+    def send_bytes(self, data: bytes) -> None:
+        self.ports.ports[0].write_packet(data)
+
     def tune(self, baud_rate: int) -> bool:
         if baud_rate not in self.cannot:
             self.bus.change_rate(baud_rate)
         return baud_rate not in self.cannot
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
 
     @property
     def heard(self) -> list[bytes]:

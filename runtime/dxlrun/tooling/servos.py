@@ -26,6 +26,6 @@ if TYPE_CHECKING:
     from dxlrun.dynamixel.tools.scanning import find_servo as find_servo
     from dxlrun.dynamixel.tools.scanning import scan as scan
     from dxlrun.dynamixel.tools.tool_line import ToolLine as ToolLine
-    from dxlrun.dynamixel.tools.tool_line import TunablePort as TunablePort
+    from dxlrun.dynamixel.tools.tool_port import TunablePort as TunablePort
 else:
     __getattr__, __dir__ = lazy_face(__name__, __file__)

@@ -145,7 +145,7 @@ def open_serial(
     try:
         line = SerialLine(path, baud_rate)
     except OSError as error:
-        raise PortError(_sentence(path, baud_rate, error, describe_holder)) from error
+        raise PortError(describe_failure(path, baud_rate, error, describe_holder)) from error
     if rs485 and not is_simulated(path):
         try:
             fcntl.ioctl(line.fileno(), _TIOCSRS485, _RS485)
@@ -176,7 +176,10 @@ def rate_remark(line: SerialLine, baud_rate: int) -> str:
     )
 
 
-def _sentence(path: str, baud_rate: int, error: OSError, describe_holder: DescribeProcess) -> str:
+def describe_failure(
+    path: str, baud_rate: int, error: OSError, describe_holder: DescribeProcess = describe_no_process
+) -> str:
+    """Return a sentence with the reason why a device could not be opened, and the remedy."""
     number = error.errno
     if number in (errno.ENOENT, errno.ENODEV, errno.ENXIO):
         return f"port {path} not found; {_what_exists()}"
@@ -219,7 +222,7 @@ def _holder(path: str, describe: DescribeProcess) -> str:
 
 
 def _processes() -> Iterable[Path]:
-    return (path for path in sorted(Path("/proc").iterdir()) if path.name.isdigit())
+    return sorted(Path("/proc").glob("[0-9]*"))  # none on systems other than Linux
 
 
 def _has_open(process: Path, device: str) -> bool:

@@ -72,7 +72,8 @@ def scan(
         New log file for all packets.
     """
     from dxlrun.dynamixel.tools import scanning
-    from dxlrun.dynamixel.tools.tool_line import ToolLine, TunablePort
+    from dxlrun.dynamixel.tools.tool_line import ToolLine
+    from dxlrun.dynamixel.tools.tool_port import TunablePort
 
     search = read_search(protocol, baud, ids)
     if output is not None:

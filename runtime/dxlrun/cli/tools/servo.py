@@ -76,7 +76,8 @@ def servo(
     """
     from dxlrun.dynamixel.tools.one_node import OneDevice
     from dxlrun.dynamixel.tools.one_servo import OneServo
-    from dxlrun.dynamixel.tools.tool_line import ToolLine, TunablePort
+    from dxlrun.dynamixel.tools.tool_line import ToolLine
+    from dxlrun.dynamixel.tools.tool_port import TunablePort
 
     search = read_search(protocol, () if baud is None else (baud,), None)
     asked = VerbCall(words, keep, yes)

@@ -4,14 +4,13 @@ nothing is written.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import AbstractContextManager
 
 import msgspec
 from msgspec.structs import replace
 
 from dxlrun.channels.event_records import EventCode
-from dxlrun.contract.serial_line import open_serial
 from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.remedies import choose_remedy
 from dxlrun.dynamixel.servo.checks import LISTEN_NS, inspect_servo, survey
@@ -20,20 +19,25 @@ from dxlrun.dynamixel.servo.mode_switches import read_limits, servo_limits
 from dxlrun.dynamixel.servo.registers import read_registers
 from dxlrun.dynamixel.tools.scanning import identity
 from dxlrun.dynamixel.tools.tool_line import ToolLine
+from dxlrun.dynamixel.tools.tool_port import TunablePort
 from dxlrun.errors import StartUpError
 from dxlrun.plan.loop_plan import JointPlan
 from dxlwire.bus_plan import BusPlan, RegisterValue, ServoPlan
-from dxlwire.clock import Clock, MonotonicClock
 from dxlwire.control_table import ControlTable, FoundDeviation, find_table, models_by_number
-from dxlwire.exchange.bus_engine import Lines
 from dxlwire.packets import PacketSink
 from dxlwire.plan.line import listen_transaction
 from dxlwire.plan.retry import extend_timeouts, retry, setup_line
-from dxlwire.port.ports import Ports, SerialPort, SerialPorts
 from dxlwire.transaction import Program, Reply, Result, TransactionOutcome
 
 NOWHERE: Mapping[str, PacketSink] = {}  # no bus logs its packets
 NO_JOINTS: Mapping[int, JointPlan] = {}
+Opened = Callable[[BusPlan], AbstractContextManager[TunablePort]]
+"""Function that opens the port of a bus."""
+
+
+def open_bus(plan: BusPlan) -> TunablePort:
+    """Open the port of a bus. Raises PortError."""
+    return TunablePort(plan.port, plan.baud_rate, rs485=plan.rs485, boot_ns=plan.boot_ns)
 
 
 class Identity(msgspec.Struct, frozen=True):
@@ -87,8 +91,7 @@ class InspectionResult(msgspec.Struct):
 def read_models(
     buses: Sequence[BusPlan], joints: Sequence[str], packets: Mapping[str, PacketSink] = NOWHERE
 ) -> Mapping[str, str]:
-    """Read which model each servo with `model: auto` in the robot file is; open the ports and close them
-    again.
+    """Read which model each servo with `model: auto` in the robot file is, bus by bus.
 
     Args:
         buses: Plans of the lines.
@@ -103,8 +106,7 @@ def read_models(
         PortError: A port cannot be opened or is gone.
     """
     concerned = [bus for bus in buses if any(servo.joint in joints for servo in bus.servos)]
-    with _lines(concerned) as ports:
-        found = identify(concerned, joints, ports, MonotonicClock(), packets)
+    found = identify(concerned, joints, packets)
     problems = [one.problem for one in found.values() if one.problem]
     if problems:
         raise StartUpError("\n".join(problems))
@@ -115,23 +117,23 @@ def inspect_buses(
     buses: Sequence[BusPlan],
     packets: Mapping[str, PacketSink] = NOWHERE,
     joints: Mapping[int, JointPlan] = NO_JOINTS,
+    opened: Opened = open_bus,
 ) -> InspectionResult:
-    """Check every servo and every declared register as a start does, without writing; open the ports and
-    close them again.
+    """Check every servo and every declared register as a start does, without writing, bus by bus.
 
     Args:
         buses: Plans of the lines.
         packets: Log of each bus's packets, by its name.
         joints: Joint of each servo that moves one alone, by row; registers are compared with the joint's
             limits.
+        opened: Opens the port of a bus.
 
     Raises:
         PortError: A port cannot be opened or is gone.
     """
-    with _lines(buses) as ports:
-        found = _run([_look(plan, joints) for plan in buses], buses, ports, MonotonicClock(), packets)
     together = InspectionResult()
-    for one in found:
+    for plan in buses:
+        one = _run(_look(plan, joints), plan, packets, opened)
         together.compared += one.compared
         together.registers += one.registers
         together.deviations += one.deviations
@@ -199,35 +201,28 @@ def stored_registers(table: ControlTable, plan: BusPlan, servo: ServoPlan) -> tu
 def identify(
     plans: Sequence[BusPlan],
     joints: Collection[str],
-    ports: Ports,
-    clock: Clock,
     packets: Mapping[str, PacketSink] = NOWHERE,
+    opened: Opened = open_bus,
 ) -> Mapping[str, Identity]:
     """Read the model numbers of the servos of these joints; return model or problem of each, by joint.
 
     The plans can have any model of the bus' protocol: only ports, IDs and times are used.
 
     Raises:
-        PortError: A line is gone.
+        PortError: A port cannot be opened or is gone.
     """
-    found = _run([_identify(plan, joints) for plan in plans], plans, ports, clock, packets)
+    found = [_run(_identify(plan, joints), plan, packets, opened) for plan in plans]
     return {one.joint: one for identities in found for one in identities}
 
 
 def _run(
-    programs: Sequence[Program[Result]],
-    plans: Sequence[BusPlan],
-    ports: Ports,
-    clock: Clock,
-    packets: Mapping[str, PacketSink],
-) -> list[Result]:
-    """Run one program per bus with longer timeouts and return the results; raise PortError if a line is
-    gone."""
-    lines = Lines(plans, ports, clock, [packets.get(plan.name) or PacketSink() for plan in plans])
-    found = lines.run_programs([extend_timeouts(program) for program in programs])
-    if lines.failure is not None:
-        raise lines.failure
-    return [one for one in found if one is not None]
+    program: Program[Result], plan: BusPlan, packets: Mapping[str, PacketSink], opened: Opened
+) -> Result:
+    """Run a program with longer timeouts on the port of a bus, and return its result; raises PortError."""
+    with opened(plan) as port:
+        tool = ToolLine(port, packets.get(plan.name))
+        tool.speak(plan.protocol, plan.baud_rate)
+        return tool.run_program(extend_timeouts(program))
 
 
 def _look(plan: BusPlan, joints: Mapping[int, JointPlan]) -> Program[InspectionResult]:
@@ -300,17 +295,3 @@ def _identity(plan: BusPlan, servo: ServoPlan, reply: Reply) -> Identity:
         f"{plan.protocol}: add one with a plug-in"
     )
     return Identity(servo.joint, "", problem)
-
-
-@contextmanager
-def _lines(buses: Sequence[BusPlan]) -> Iterator[SerialPorts]:
-    opened = []
-    try:
-        for bus in buses:
-            opened.append(open_serial(bus.port, bus.baud_rate, rs485=bus.rs485, boot_ns=bus.boot_ns))
-        yield SerialPorts(
-            [SerialPort(port.fileno(), bus.port) for port, bus in zip(opened, buses, strict=True)]
-        )
-    finally:
-        for port in opened:
-            port.close()

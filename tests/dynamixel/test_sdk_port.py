@@ -1,0 +1,112 @@
+"""The maker's packet handlers on a tool's port: their mistakes are corrected, and only tools load them."""
+
+import subprocess
+import sys
+
+import pytest
+from dynamixel_sdk import COMM_SUCCESS, Protocol2PacketHandler
+from hypothesis import given
+from hypothesis import strategies as st
+from tests.kit.rigs import VirtualLine
+
+from dxlrun.dynamixel.tools.one_servo import OneServo
+from dxlrun.dynamixel.tools.scanning import Search, find_servo, scan
+from dxlrun.dynamixel.tools.sdk_port import StuffedPackets
+from dxlrun.dynamixel.tools.tool_line import ToolLine
+from dxlrun.dynamixel.tools.tool_port import TunablePort
+from dxlrun.errors import PortError
+from dxlsim.simulation_plan import BusConfig, ServoConfig
+from dxlwire.wire import protocol2
+
+LOADED = "import sys; import {}; print(sorted({{'serial', 'dynamixel_sdk'}} & set(sys.modules)))"
+
+
+class Wire:
+    """A port for the packet handlers: keeps what is sent, and has one reply."""
+
+    def __init__(self, reply=b""):
+        self.is_using, self.sent, self._reply = False, b"", reply
+        self.clearPort = self.setPacketTimeout = lambda *_: None
+
+    def writePort(self, packet):
+        self.sent = bytes(packet)
+        return len(packet)
+
+    def isPacketTimeout(self):
+        return not self._reply
+
+    def readPort(self, length):
+        data, self._reply = self._reply[:length], self._reply[length:]
+        return data
+
+
+def exchanged(handler, data):
+    """Return the bytes of a write of data, and what a read of a servo that has these data gives."""
+    out, back = Wire(), Wire(protocol2.status_packet(1, 0, data))
+    handler.writeTxOnly(out, 1, 100, len(data), data)
+    found, result, _ = handler.readTxRx(back, 1, 100, len(data))
+    assert result == COMM_SUCCESS
+    return out.sent, bytes(found)
+
+
+@given(st.lists(st.sampled_from([0xFF, 0xFD, 0x00]), min_size=1, max_size=24).map(bytes))
+def test_parameters_that_look_like_a_header_are_stuffed(data):
+    assert exchanged(StuffedPackets(), data) == (protocol2.write_range(1, 100, data), data)
+
+
+@pytest.mark.parametrize("data", ["ff ff fd ff", "ff ff fd 01 ff fd fd 01"])
+def test_sdk_alone_sends_or_reads_something_else(data):
+    """As soon as this fails, `StuffedPackets` can go."""
+    data = bytes.fromhex(data)
+    assert exchanged(Protocol2PacketHandler(), data) != (protocol2.write_range(1, 100, data), data)
+
+
+def test_register_whose_bytes_are_a_header_is_written_and_read():
+    line = VirtualLine(ServoConfig(1, "XM430-W350", 2.0))
+    (found,) = find_servo(tool := ToolLine(line), 1, Search((2.0,), (57_600,)))
+    one = OneServo(tool, found)
+    one.write_registers([one.register("homing_offset", -131_073)])  # ff ff fd ff
+    assert one.read_items(["homing_offset"]) == {"homing_offset": -131_073}
+    assert line.bus.servo(1).registers["homing_offset"] == -131_073 & 0xFFFF_FFFF
+
+
+@pytest.mark.parametrize(
+    "module", ["dxlrun.run.loop_process", "dxlrun.run.guardian", "dxlrun.cli.tools.servo"]
+)
+def test_neither_loop_nor_help_loads_the_sdk(module):
+    said = subprocess.run(
+        [sys.executable, "-c", LOADED.format(module)], capture_output=True, text=True, check=True
+    )
+    assert said.stdout == "[]\n"
+
+
+@pytest.fixture
+def macos(monkeypatch):
+    """Open ports by pyserial."""
+    monkeypatch.setattr(sys, "platform", "darwin")
+
+
+def test_port_that_pyserial_opens_finds_servos(simulated_line, macos):
+    servos = (ServoConfig(3, "XM430-W350", 2.0), ServoConfig(7, "XL430-W250", 1.0))
+    path, finish = simulated_line(BusConfig("main", 57_600, servos, 2.0))
+    with TunablePort(path) as port:
+        found = scan(ToolLine(port), Search((2.0,), (1_000_000, 57_600), tuple(range(1, 9)))).servos
+    assert [(one.servo_id, one.model, one.remarks) for one in found] == [
+        (3, "XM430-W350", ()),
+        (7, "XL430-W250", ()),
+    ]
+    assert {entry.data[7] for entry in finish() if entry.direction == "in"} == {1, 2}
+
+
+def test_pyserial_names_what_is_wrong_with_a_port(simulated_line, macos):
+    with pytest.raises(PortError, match="port /dev/none not found"):
+        TunablePort("/dev/none")
+    path, finish = simulated_line(BusConfig("main", 57_600, (), 2.0))
+    with pytest.raises(PortError, match="rs485: true}` needs Linux, and this is darwin"):
+        TunablePort(path, rs485=True)
+    with TunablePort(path) as port:
+        with pytest.raises(PortError, match=f"{path} is in use by"):
+            TunablePort(path)
+        finish()
+        with pytest.raises(PortError, match=f"{path} is gone"):
+            port.receive_bytes(port.clock.now_ns() + 1_000_000_000)
