@@ -86,10 +86,12 @@ def listings(protocol: float) -> tuple[Listing, ...]:
     }
     # Only the keys before the first table are parsed here: a process needs few of the models.
     heads = {name: tomllib.loads(text.partition("\n[")[0]) for name, text in texts.items()}
-    return tuple(_listing(name, heads, texts) for name in texts)
+    # Several models extend one file.
+    parsed = functools.cache(lambda name: tomllib.loads(texts[name]))
+    return tuple(_listing(name, heads, parsed) for name in texts)
 
 
-def _listing(name: str, heads: Mapping[str, Entry], texts: Mapping[str, str]) -> Listing:
+def _listing(name: str, heads: Mapping[str, Entry], parsed: Callable[[str], Entry]) -> Listing:
     """Return one model from the keys at the start of its files. Whole files are parsed when the table is
     built."""
     chain = _chain(name, heads)
@@ -98,9 +100,7 @@ def _listing(name: str, heads: Mapping[str, Entry], texts: Mapping[str, str]) ->
         names=(str(head["model"]), *words(heads[name].get("aliases", []))),
         model_number=whole(head, "model_number"),
         firmware=whole(head, "firmware") if "firmware" in head else 0,
-        build=functools.cache(
-            lambda: build_table(resolve(name, {each: tomllib.loads(texts[each]) for each in chain}))
-        ),
+        build=functools.cache(lambda: build_table(resolve(name, {each: parsed(each) for each in chain}))),
     )
 
 
