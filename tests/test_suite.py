@@ -257,7 +257,7 @@ def test_variables_only_name_what_is_elsewhere() -> None:
         r"(?:getenv\(|environ\.get\(|environ\[)\s*\"(DXLRUN_\w+)\"|\"(DXLRUN_\w+)\" (?:not )?in os\.environ"
     )
     names = {name for text in texts for pair in re.findall(read, text) for name in pair if name}
-    assert names == {"DXLRUN_BAM_RECORDINGS", "DXLRUN_ROS2_PYTHON"}
+    assert names == {"DXLRUN_BAM_RECORDINGS", "DXLRUN_LEROBOT_PYTHON", "DXLRUN_ROS2_PYTHON"}
 
 
 def test_each_fragment_of_the_changelog_is_one_that_towncrier_takes() -> None:

@@ -113,6 +113,7 @@ class LoggedPlan(msgspec.Struct):
     loop: LoopPlan = NO_LOOP
     buses: list[LoggedBus] = []
     mechanics: MechanicsPlan = MechanicsPlan()
+    groups: dict[str, tuple[str, ...]] = {}  # Joints of named groups
 
     def joint(self, name: str) -> JointPlan:
         """Return a joint by name; for a joint that is not in the plan, a placeholder with its name."""

@@ -9,6 +9,7 @@ import pytest
 
 ALLOWED = {
     r"DXLRUN_BAM_RECORDINGS": "recordings of real servos, 300 MB",
+    r"DXLRUN_LEROBOT_PYTHON": "lerobot has torch with it, 8 GB; a campaign of releases",
     r"/dev/uinput": "the kernel of a container makes no input devices",
     r"no IPv6": "the network of a container",
     r"no real time to give": "the limits of the account",

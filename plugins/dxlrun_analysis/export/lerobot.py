@@ -1,39 +1,47 @@
-"""LeRobot export: joint states and goals of a log as a data set, in the layout of LeRobotDataset v3.0.
+"""LeRobot export: episodes of logs as a data set, in the layout of LeRobotDataset v3.0.
 
 Source: Hugging Face LeRobot, docs "LeRobotDataset v3.0", and the names and types of columns that lerobot 0.4
 writes: data/chunk-000/file-000.parquet with a row per frame, meta/info.json with features and rate,
 meta/stats.json, meta/tasks.parquet, meta/episodes/chunk-000/file-000.parquet.
 
-A frame is a period of the loop. `observation.state` is the position of each joint, `action` its goal
-position; a joint that never received one has its goal velocity, effort or PWM. Frames begin when every joint
-has both. Skipped periods and lost states repeat the preceding frame, because a servo keeps its goal. After
-cycles that are missing for another reason, a new episode begins.
+`observation.state` is the position of each joint that observes, `action` the goal position of each joint that
+acts; a joint that never received one has its goal velocity, effort or PWM. Policies such as ACT refuse a data
+set that has neither images nor `observation.environment_state`; that has what the robot measures of its
+environment: efforts of the joints that observe, and states of sensors and devices.
 """
 
 from __future__ import annotations
 
-import itertools
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from dxlrun import Log, LogError, LogReader
-from dxlwire import COMMAND_INTERFACES
+from dxlrun import InputError, LogReader
+from dxlrun_analysis.export.episodes import (
+    FPS,
+    Choice,
+    Columns,
+    EpisodeFrames,
+    Survey,
+    Values,
+    columns_of,
+    frames_of,
+    survey,
+)
 
 VERSION = "v3.0"
 _DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 _EPISODES = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 _PLACE = {"chunk_index": 0, "file_index": 0}
 _SUFFIXES = {"position": "pos", "velocity": "vel", "effort": "effort", "pwm": "pwm"}
-_STATE, _ACTION = "observation.state", "action"
+_STATE, _ACTION, _ENVIRONMENT = "observation.state", "action", "observation.environment_state"
 _NUMBERS: tuple[tuple[str, str], ...] = (
     ("timestamp", "float32"),
     ("frame_index", "int64"),
@@ -41,7 +49,6 @@ _NUMBERS: tuple[tuple[str, str], ...] = (
     ("index", "int64"),
     ("task_index", "int64"),
 )
-Frames = NDArray[np.float32]
 Floats = NDArray[np.float64]
 
 
@@ -79,33 +86,72 @@ class _Statistics:
         }
 
 
-def write_dataset(reader: LogReader, directory: Path) -> int:
-    """Write a log as a LeRobot data set into a new directory; return the number of frames.
+@dataclass(slots=True)
+class Written:
+    """Counts of a data set that was written."""
+
+    fps: int
+    columns: Columns
+    frames: int = 0
+    held: int = 0
+    """Frames with a value that is not of their own period"""
+    episodes: list[int] = field(default_factory=list)
+    """Number of episodes of each log"""
+    damage: list[str] = field(default_factory=list)
+    """A sentence for each incomplete log"""
+
+
+def write_dataset(readers: Sequence[LogReader], directory: Path, choice: Choice) -> Written:
+    """Write logs as a LeRobot data set into a new directory.
 
     Raises:
-        LogError: The log has no frames, or its rate is not a whole number of Hz.
+        InputError: All logs that do not belong in one data set, and all joints without values.
+        LogError: A log cannot be read.
         OSError: A file cannot be written.
     """
-    goals = _commanded(reader)
+    surveys = [survey(reader) for reader in readers]
+    columns = columns_of(surveys, choice)
+    written = Written(_rate(surveys, choice.fps), columns)
     file = directory / _DATA.format(**_PLACE)
     file.parent.mkdir(parents=True)
-    made = _Dataset(file)
+    made = _Dataset(file, columns, written.fps)
     with closing(made):
-        for stretch in _stretches(reader, goals):
-            made.write_frames(stretch)
-    if made.last is None:
-        raise LogError(f"{reader.path}: no frames: every cycle lacks the position or the goal of a joint")
-    _write_meta(directory, made.last, _features(made.last, goals), made)
-    return made.frames
+        for one in surveys:
+            before = len(made.episodes)
+            for frames in frames_of(one, columns, written.fps):
+                made.write_frames(frames)
+                written.held += frames.held
+            written.episodes.append(len(made.episodes) - before)
+            written.damage += [f"{one.path}: {sentence}" for sentence in one.about.damage]
+    _check_frames(surveys, written)
+    written.frames = made.frames
+    robot = surveys[0].about.header.robot
+    _write_meta(directory, robot, choice.task or f"recorded motion of {robot}", made)
+    return written
 
 
-class _Stretch(msgspec.Struct, frozen=True, eq=False):
-    """Consecutive frames of one slice of the log: states and goals of all joints."""
+def _rate(surveys: Sequence[Survey], asked: int | None) -> int:
+    """Return the frames per second. Raises InputError for more than the loop of a log has."""
+    rates = [1e9 / one.about.period_ns for one in surveys]
+    if asked is None:
+        return max(1, min(FPS, int(min(rates) * (1 + 1e-6))))
+    slow = [
+        f"{one.path}: --fps {asked} is above the rate of its loop, {rate:.4g} Hz; give {rate:.0f} or less"
+        for one, rate in zip(surveys, rates, strict=True)
+        if asked > rate * (1 + 1e-6)
+    ]
+    if slow:
+        raise InputError("\n".join(slow))
+    return asked
 
-    log: Log
-    states: Frames  # Shape (frames, joints)
-    actions: Frames  # Shape (frames, commanded joints)
-    begins: bool  # The frames do not continue the preceding ones: an episode begins
+
+def _check_frames(surveys: Sequence[Survey], written: Written) -> None:
+    empty = [one for one, count in zip(surveys, written.episodes, strict=True) if not count]
+    if empty:
+        what = (
+            "no frames: in no cycle all joints have a state and a goal; omit this log, or name other joints"
+        )
+        raise InputError("\n".join(f"{one.path}: {what}" for one in empty))
 
 
 @dataclass(slots=True)
@@ -120,31 +166,35 @@ class _Episode:
 class _Dataset:
     """Writer of the frames of a data set. Keeps the episodes and statistics for the metadata."""
 
-    def __init__(self, file: Path) -> None:
-        self._file = file
-        self._writer: pq.ParquetWriter | None = None
+    def __init__(self, file: Path, columns: Columns, fps: int) -> None:
+        self.columns, self.fps = columns, fps
         self.episodes: list[_Episode] = []
         self.statistics: dict[str, _Statistics] = {}
-        self.last: Log | None = None
+        self._file = file
+        self._writer: pq.ParquetWriter | None = None
 
     @property
     def frames(self) -> int:
         """Number of frames written so far."""
         return self.episodes[-1].end if self.episodes else 0
 
-    def write_frames(self, stretch: _Stretch) -> None:
+    def write_frames(self, frames: EpisodeFrames) -> None:
         """Write frames to the data file. Raises OSError."""
-        self.last = stretch.log
-        if stretch.begins:
+        if frames.begins:
             self.episodes.append(_Episode(self.frames, self.frames))
         episode = self.episodes[-1]
-        index = np.arange(episode.end, episode.end + len(stretch.states))
-        numbers = _numbers(index, episode.begin, len(self.episodes) - 1, _rate(stretch.log))
-        columns = {_STATE: _vectors(stretch.states), _ACTION: _vectors(stretch.actions)}
+        index = np.arange(episode.end, episode.end + len(frames.values))
+        numbers = _numbers(index, episode.begin, len(self.episodes) - 1, self.fps)
+        ends = (0, *np.cumsum([len(names) for names in _names(self.columns).values()]).tolist())
+        vectors = {
+            name: frames.values[:, begin:end]
+            for name, begin, end in zip(_names(self.columns), ends, ends[1:], strict=False)
+        }
+        columns = {name: _vectors(values) for name, values in vectors.items()}
         table = pa.table(columns | {name: pa.array(values) for name, values in numbers.items()})
         self._writer = self._writer or pq.ParquetWriter(self._file, table.schema, compression="snappy")
         self._writer.write_table(table)
-        for name, values in {_STATE: stretch.states, _ACTION: stretch.actions, **numbers}.items():
+        for name, values in {**vectors, **numbers}.items():
             for statistics in (self.statistics, episode.statistics):
                 statistics.setdefault(name, _Statistics()).add_rows(values.reshape(len(index), -1))
         episode.end += len(index)
@@ -155,91 +205,14 @@ class _Dataset:
             self._writer.close()
 
 
-def _commanded(reader: LogReader) -> dict[str, str]:
-    """Return the command interface of each joint that received goals: position if any was sent, else
-    velocity, effort or PWM."""
-    seen: dict[str, NDArray[np.bool_]] = {}
-    joints: tuple[str, ...] = ()
-    for log in reader.slices():
-        joints = log.joints
-        for name in COMMAND_INTERFACES:
-            found = np.isfinite(log.cycles[f"goal_{name}"]).any(axis=0)
-            seen[name] = found | seen.get(name, np.zeros(len(joints), np.bool_))
-    return {
-        joint: next(name for name in COMMAND_INTERFACES if seen[name][row])
-        for row, joint in enumerate(joints)
-        if any(seen[name][row] for name in COMMAND_INTERFACES)
+def _names(columns: Columns) -> dict[str, list[str]]:
+    """Return the names of the elements of each vector, in the order of the values of frames."""
+    names = {
+        _STATE: [f"{joint}.pos" for joint in columns.observation],
+        _ACTION: [f"{joint}.{_SUFFIXES[interface]}" for joint, interface in columns.action.items()],
+        _ENVIRONMENT: list(columns.environment),
     }
-
-
-def _stretches(reader: LogReader, goals: Mapping[str, str]) -> Iterator[_Stretch]:
-    """Yield the frames of a log, slice by slice; `goals` has the command interface of each joint.
-
-    Raises:
-        LogError: A data set cannot have this rate.
-    """
-    held: tuple[Frames, Frames, NDArray[np.void]] | None = None
-    begun = False
-    for log in reader.slices():
-        cycles = log.cycles
-        if not (len(cycles) and goals):
-            continue
-        states = np.where(cycles["age_ns"] >= 0, cycles["position"], np.nan).astype(np.float32)
-        actions = np.empty((len(cycles), len(goals)), np.float32)
-        for index, (joint, name) in enumerate(goals.items()):
-            actions[:, index] = cycles[f"goal_{name}"][:, log.joints.index(joint)]
-        # The newest row of the preceding slice is repeated until the first row of this one.
-        if held is not None:
-            states, actions = np.vstack((held[0], states)), np.vstack((held[1], actions))
-            cycles = np.concatenate((held[2], cycles))
-        states, actions = _filled(states), _filled(actions)
-        known = held is not None
-        held = states[-1:], actions[-1:], cycles[-1:]
-        whole = np.flatnonzero(np.isfinite(states).all(axis=1) & np.isfinite(actions).all(axis=1))
-        steps: NDArray[np.int64] = np.diff(cycles["cycle"])
-        follows = steps == cycles["skipped"][1:].astype(np.int64) + 1
-        _check_rate(log, cycles, steps, follows)
-        first = int(whole[0]) if len(whole) else len(cycles)
-        cuts = [first, *(np.flatnonzero(~follows[first:]) + first + 1).tolist(), len(cycles)]
-        for begin, end in itertools.pairwise(cuts):
-            if begin == end:
-                continue
-            times = np.append(steps[begin : end - 1], 1)
-            # The row was already yielded with the preceding slice.
-            before = int(known and begun and begin == 0)
-            rows = np.repeat(np.arange(begin, end), times)[before:]
-            if len(rows):
-                yield _Stretch(log, states[rows], actions[rows], not before)
-            begun = True
-
-
-def _filled(values: NDArray[np.floating]) -> Frames:
-    """Return rows in which each unknown value is replaced by that of the preceding row."""
-    rows = np.where(np.isfinite(values), np.arange(len(values))[:, None], 0)
-    np.maximum.accumulate(rows, axis=0, out=rows)
-    filled: Frames = np.take_along_axis(values, rows, axis=0).astype(np.float32)
-    return filled
-
-
-def _check_rate(
-    log: Log, cycles: NDArray[np.void], steps: NDArray[np.int64], follows: NDArray[np.bool_]
-) -> None:
-    rate = 1e9 / log.period_ns
-    if abs(rate - round(rate)) > 1e-6 * rate:
-        raise LogError(
-            f"{log.path}: a LeRobot data set needs a whole number of frames per second, not a "
-            f"rate of {rate:g} Hz"
-        )
-    off = np.abs(np.diff(cycles["scheduled_ns"].astype(np.int64)) - steps * log.period_ns)
-    if np.any(off[follows] > log.period_ns // 2):
-        raise LogError(
-            f"{log.path}: a LeRobot data set needs a constant rate, but the rate was changed, or "
-            "the run was paused"
-        )
-
-
-def _rate(log: Log) -> int:
-    return round(1e9 / log.period_ns)
+    return {feature: elements for feature, elements in names.items() if elements}
 
 
 def _numbers(index: NDArray[np.int64], begin: int, episode: int, rate: int) -> dict[str, NDArray[np.generic]]:
@@ -248,7 +221,7 @@ def _numbers(index: NDArray[np.int64], begin: int, episode: int, rate: int) -> d
     return {name: value.astype(kind) for (name, kind), value in zip(_NUMBERS, values, strict=True)}
 
 
-def _vectors(values: Frames) -> pa.Array:
+def _vectors(values: Values) -> pa.Array:
     """Convert rows of numbers to an Arrow column of vectors.
 
     A row of one number becomes a plain number, as LeRobot has features of shape (1,).
@@ -257,35 +230,29 @@ def _vectors(values: Frames) -> pa.Array:
     return flat if values.shape[1] == 1 else pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
 
 
-def _features(log: Log, goals: Mapping[str, str]) -> dict[str, dict[str, object]]:
-    actions = [f"{joint}.{_SUFFIXES[name]}" for joint, name in goals.items()]
+def _features(columns: Columns) -> dict[str, dict[str, object]]:
     features: dict[str, dict[str, object]] = {
-        _STATE: {
-            "dtype": "float32",
-            "shape": [len(log.joints)],
-            "names": [f"{joint}.pos" for joint in log.joints],
-        },
-        _ACTION: {"dtype": "float32", "shape": [len(actions)], "names": actions},
+        feature: {"dtype": "float32", "shape": [len(names)], "names": names}
+        for feature, names in _names(columns).items()
     }
     return features | {name: {"dtype": kind, "shape": [1], "names": None} for name, kind in _NUMBERS}
 
 
-def _write_meta(directory: Path, log: Log, features: Mapping[str, object], made: _Dataset) -> None:
-    task = f"recorded motion of {log.header.robot}"
+def _write_meta(directory: Path, robot: str, task: str, made: _Dataset) -> None:
     info = {
         "codebase_version": VERSION,
-        "robot_type": log.header.robot,
+        "robot_type": robot,
         "total_episodes": len(made.episodes),
         "total_frames": made.frames,
         "total_tasks": 1,
         "chunks_size": 1000,
         "data_files_size_in_mb": 100,
         "video_files_size_in_mb": 200,
-        "fps": _rate(log),
+        "fps": made.fps,
         "splits": {"train": f"0:{len(made.episodes)}"},
         "data_path": _DATA,
         "video_path": None,
-        "features": features,
+        "features": _features(made.columns),
     }
     rows: list[dict[str, object]] = []
     for number, episode in enumerate(made.episodes):
