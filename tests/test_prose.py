@@ -10,6 +10,7 @@ import io
 import re
 import tokenize
 from collections.abc import Iterator
+from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -75,9 +76,15 @@ def descriptions_of(call: ast.Call) -> Iterator[Text]:
             yield Text(value.lineno, value.value, "description")
 
 
+@lru_cache(1)
+def nodes_of(source: str) -> list[ast.AST]:
+    """Return all nodes of a Python source."""
+    return [*ast.walk(ast.parse(source))]
+
+
 def texts_of(source: str) -> Iterator[Text]:
     """Yield the docstrings, attribute docstrings, descriptions of keys and comments of a Python source."""
-    for node in ast.walk(ast.parse(source)):
+    for node in nodes_of(source):
         if isinstance(node, ast.Call):
             yield from descriptions_of(node)
         if not isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
@@ -101,9 +108,9 @@ def messages_of(source: str) -> Iterator[Text]:
 
     A field of an f-string is `{}`.
     """
-    tree = ast.parse(source)
-    skipped = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
-    for node in ast.walk(tree):
+    nodes = nodes_of(source)
+    skipped = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
+    for node in nodes:
         if isinstance(node, ast.JoinedStr):
             skipped |= {id(part) for part in node.values}
             parts = [part.value if isinstance(part, ast.Constant) else "{}" for part in node.values]

@@ -14,6 +14,7 @@ from tests.kit.pages import page_text
 
 from dxlrun.testing import read_log, simulated_robot
 
+pytestmark = pytest.mark.long
 ROOT = Path(__file__).parents[2]
 ROBOT, MOTION = ROOT / "robots/effort_arm.yaml", ROOT / "robots/motions/effort_arm_lift.yaml"
 PROGRAM, _ = re.findall(r"```python\n(.*?)```", page_text("many-runs.md"), re.DOTALL)

@@ -15,6 +15,7 @@ from dxlrun.errors import ProcessFault
 from dxlrun_lab import stress
 from dxlrun_lab.stress import Stress
 
+pytestmark = pytest.mark.long
 SMALL = 16 << 20
 
 

@@ -14,6 +14,7 @@ from tests.kit.campaigns import campaign
 from dxlrun.testing import read_log, simulated_robot
 from dxlrun_analysis.replay import replay_log
 
+pytestmark = pytest.mark.long
 ROBOTS = Path(__file__).parents[2] / "robots"
 pytest.importorskip("mujoco", reason="bodies of a URDF are moved by MuJoCo")
 

@@ -8,7 +8,7 @@ import pytest
 
 from dxlrun.channels.shared_memory import SOURCE
 
-pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
+pytestmark = [pytest.mark.long, pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")]
 MODEL = Path(__file__).with_name("ring_model.c")
 RINGS = [  # writers, words of the ring, and of each record's payload
     "2 8 1 1 1",  # two records and a third one; each entry has three words more
