@@ -28,7 +28,7 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import zip_longest
+from itertools import count, zip_longest
 from operator import itemgetter
 from pathlib import Path
 from zlib import crc32
@@ -280,7 +280,7 @@ class Side:
 
     def _plan_reads(self):
         if self.hardware._by_kernel is None:
-            self.hardware._by_kernel = self.hardware._plan_reads()
+            self.hardware._by_kernel = self.hardware._exchange.plan_reads()
 
     def answer(self, replies):
         """Prepare the replies of the lines to the reads of a cycle."""
@@ -449,7 +449,7 @@ def devices_of(number):
     columns = sum(map(len, DEVICES)) * number
     for index, names in enumerate(DEVICES):
         items = {name: table.items[name] for name in names}
-        blocks = device_blocks(LineTimes(1_000_000, 0, 500_000, protocol2), table, items, columns)
+        blocks = device_blocks(LineTimes(1_000_000, 0, 500_000, protocol2), table, items, count(columns))
         columns += len(names)
         row = number * len(DEVICES) + index
         found.append((DevicePlan(f"board_{row}", 100 + index, table.model, None, row, blocks), table))

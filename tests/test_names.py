@@ -15,8 +15,8 @@ FEATURE = "fixed name of a feature's file"
 BARE = {
     **dict.fromkeys(("prepare", "begin", "judge", "end"), CONTRACT),
     **dict.fromkeys(("get", "listen", "play", "resume", "unload", "wait"), STEERING),
-    "read": "public contract of sensors",
-    "write": "file-like object",
+    "read": "public contract of sensors, and of the servos of a script",
+    "write": "file-like object, and the servos of a script",
     "tell": "file-like object",
     "accept": "overrides `socket.socket.accept`",
     "receive": "ASGI callable",
@@ -24,8 +24,8 @@ BARE = {
 }
 DEFINITIONS = {
     "prepare": 9,
-    "read": 5,
-    "write": 3,
+    "read": 7,
+    "write": 5,
     **dict.fromkeys(("begin", "judge", "end", "get", "wait"), 2),
 }
 """Definitions of bare verbs, 1 if not here. A new one needs the same reason, and is counted here."""
@@ -33,6 +33,8 @@ SHARED_METHODS = {
     **dict.fromkeys(("close", "fileno"), "protocol of Python"),
     **dict.fromkeys(("update", "interfaces", "on_activate", "on_configure", "on_command"), CONTRACT),
     **dict.fromkeys(("on_parameters", "on_goal", "on_deactivate", "prepare"), CONTRACT),
+    "read": "public contract of sensors, and of the servos of a script",
+    "report": "protocol `ReportSink`",
     "mistakes": "hook of `ParametersModel`",
     "add_slice": "protocol `Collector` of the analysis",
     "perform_on": "members of the union `Action` of the view",
@@ -41,6 +43,7 @@ SHARED_METHODS = {
 SHARED_CLASSES = {
     "Switch": "advertised by the service for viewers, and in the description of the HTTP interface",
     "TorqueRequest": "advertised by the service for viewers, and in the description of the HTTP interface",
+    "Bus": "face of dxlwire, and in the schema of robot files",
     "RobotModel": "contract of controllers, and in the schema of robot files",
     "Point": "message of ROS 2, and in the schema of motion files",
     "PositionsCommand": "title in the schema of a command",

@@ -22,7 +22,12 @@ from dxlrun.control.controllers.plugin_loading import load_plugins
 from dxlrun.plan.robot_plan import Plan
 from dxlrun.run.assembly import LoopHost, Sinks, assemble
 from dxlrun_lab.late_servos import Sent
+from dxlwire.bus.blocking_bus import ServoSet
+from dxlwire.bus.programs import Addressed
+from dxlwire.bus.servo_group import ServoGroup
+from dxlwire.bus.session import Session, line_plan
 from dxlwire.clock import MonotonicClock
+from dxlwire.control_table import find_table
 from dxlwire.packets import PacketKind, PacketLog
 from dxlwire.port.ports import ReplyPolling, SerialPort, SerialPorts
 from exchange.case import Case, Registers
@@ -160,6 +165,50 @@ class Ours:
             os.close(self._ring)
 
 
+class Script:
+    """`dxlwire.Bus`, as a script uses it: SI units at both ends."""
+
+    def __init__(self, path: str, case: Case, plan: Plan) -> None:
+        (bus,) = plan.buses
+        descriptor = os.open(path, os.O_RDWR | os.O_NOCTTY)
+        tty.setraw(descriptor)
+        ports = SerialPorts([SerialPort(descriptor, path)])
+        timing = line_plan(path, bus.baud_rate, case.protocol, bus.latency_ns)
+        session = Session(ports, MonotonicClock(), timing, partial(os.close, descriptor))
+        table = find_table(case.model, case.protocol)
+        servos = ServoSet(ServoGroup(session, [Addressed(each, table) for each in case.ids]))
+        self._session = session
+        states = table.effort_item, table.present_speed_item, "present_position"
+        self._read = servos.reader(*states)
+        self._write = servos.writer("goal_position", table.goal_speed_item)
+        self._goals = [np.full(case.servos, tick * table.rad_per_tick) for tick in Registers.of(plan).ticks]
+        self._everybody = b"\1" * case.servos
+        self._turn = 0
+
+    def start(self) -> None:
+        """Nothing is needed."""
+
+    def exchange(self) -> bool:
+        """Read, and write other goals."""
+        state = self._read()
+        self._turn = 1 - self._turn
+        self._write(self._goals[self._turn], 0.0)
+        return state.valid.tobytes() == self._everybody  # as in `Ours`
+
+    def recover(self) -> None:
+        """Exchange until the kernel reads again."""
+        for _ in range(_MOST_RECOVERIES):
+            self.exchange()
+
+    def sent(self) -> Sent:
+        """Nothing is known."""
+        return ()
+
+    def close(self) -> None:
+        """Close the line."""
+        self._session.close()
+
+
 def _sdk(path: str, case: Case, plan: Plan, values: bool, *, fast: bool = False) -> Host:
     return Sdk(path, case, Registers.of(plan), values=values, fast=fast)
 
@@ -172,6 +221,7 @@ HOSTS: Sequence[HostKind] = (
     HostKind("ours", "dxlrun", lambda path, case, plan, _: Ours(path, plan)),
     HostKind("polled", "dxlrun", lambda path, case, plan, _: Ours(path, plan, polled=True)),
     HostKind("unrecorded", "dxlrun", lambda path, case, plan, _: Ours(path, plan, recorded=False)),
+    HostKind("bus", "dxlwire", lambda path, case, plan, _: Script(path, case, plan)),
     HostKind("sdk", "dynamixel_sdk", _sdk),
     HostKind("sdk-fast", "dynamixel_sdk", partial(_sdk, fast=True), (2.0,)),
     HostKind("rustypot", "rustypot", _rustypot),

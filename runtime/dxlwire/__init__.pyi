@@ -1,3 +1,14 @@
+from dxlwire.bus.async_bus import AsyncBus as AsyncBus
+from dxlwire.bus.async_bus import AsyncServoReader as AsyncServoReader
+from dxlwire.bus.async_bus import AsyncServoSet as AsyncServoSet
+from dxlwire.bus.async_bus import AsyncServoWriter as AsyncServoWriter
+from dxlwire.bus.blocking_bus import Bus as Bus
+from dxlwire.bus.blocking_bus import ServoReader as ServoReader
+from dxlwire.bus.blocking_bus import ServoSet as ServoSet
+from dxlwire.bus.blocking_bus import ServoWriter as ServoWriter
+from dxlwire.bus.repeated_exchange import ServoStates as ServoStates
+from dxlwire.bus.session import Session as Session
+from dxlwire.bus.session import line_plan as line_plan
 from dxlwire.bus_plan import BusPlan as BusPlan
 from dxlwire.bus_plan import ServoPlan as ServoPlan
 from dxlwire.clock import Clock as Clock
@@ -13,6 +24,8 @@ from dxlwire.exceptions import DxlError as DxlError
 from dxlwire.exceptions import InputError as InputError
 from dxlwire.exceptions import NotCompiled as NotCompiled
 from dxlwire.exceptions import PortError as PortError
+from dxlwire.exceptions import ServoError as ServoError
+from dxlwire.exceptions import ServoFailure as ServoFailure
 from dxlwire.modes import COMMAND_INTERFACES as COMMAND_INTERFACES
 from dxlwire.modes import Mode as Mode
 from dxlwire.modes import mode_of as mode_of

@@ -5,14 +5,15 @@ Exception
 └── DxlError                       every error that is raised on purpose; exit code 1
     ├── InputError (ValueError)    a file or an argument is wrong; exit code 2
     ├── NotCompiled                a compiled C source is missing; the installation is broken
-    └── PortError (OSError)        a serial line cannot be opened, or is gone
+    ├── PortError (OSError)        a serial line cannot be opened, or is gone
+    └── ServoError                 servos did not answer, or refused
 ```
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -80,6 +81,28 @@ class NotCompiled(DxlError, RuntimeError):
 
 class PortError(DxlError, OSError):
     """A serial line cannot be opened, is in use by another program, or was lost during use."""
+
+
+FailureKind = Literal["no_reply", "refused", "torque_on", "not_written", "wrong_model", "unknown_model"]
+
+
+@dataclass(frozen=True, slots=True)
+class ServoFailure:
+    """Failure of one servo: its kind, for programs, and a sentence for people."""
+
+    kind: FailureKind
+    text: str
+
+
+class ServoError(DxlError):
+    """Servos did not do what was asked of them. `failures` has one entry for each of these servos, by ID;
+    the others did it."""
+
+    def __init__(self, port: str, failures: Mapping[int, ServoFailure]) -> None:
+        self.failures = dict(failures)
+        super().__init__(
+            "\n".join(f"ID {servo_id} on {port} {one.text}" for servo_id, one in self.failures.items())
+        )
 
 
 _WORD = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|[0-9]+")

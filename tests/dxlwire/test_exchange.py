@@ -8,12 +8,18 @@ import time
 import tty
 
 import pytest
+from msgspec.structs import replace
 from tests.kit.exchanges import IDS, MODELS, GoodReplies, Host, SpoiltReplies
 from tests.kit.plans import ScriptedLine, make_plan
 
+from dxlwire.bus.blocking_bus import ServoSet
+from dxlwire.bus.programs import Addressed
+from dxlwire.bus.servo_group import ServoGroup
+from dxlwire.bus.session import Session, line_plan
 from dxlwire.clock import MonotonicClock
+from dxlwire.control_table import find_table
 from dxlwire.exchange.bus_engine import Lines
-from dxlwire.packets import PacketKind
+from dxlwire.packets import RECORD, Desk, PacketKind, PacketLog
 from dxlwire.plan.line import Line
 from dxlwire.port.ports import SerialPort, SerialPorts
 from dxlwire.transaction import TransactionOutcome
@@ -133,8 +139,75 @@ class TerminalHost(EngineHost):
         os.close(self.host)
 
 
+class DeskLog(PacketLog):
+    """A log with memory for the packets that the kernel records."""
+
+    def __init__(self):
+        self.packets, self._records, self._used = [], memoryview(bytearray(1 << 16)), memoryview(bytearray(8))
+
+    @property
+    def desk(self):
+        return Desk(self._records, self._used.cast("Q"))
+
+    def packet(self, _, kind, servo_id, first_ns, last_ns, data):
+        self.commit_packets()
+        self.packets.append((kind, bytes(data), last_ns))
+
+    def commit_packets(self):
+        at, end = 0, int.from_bytes(self._used, "little")
+        while at < end:
+            _, kind, _, size, _, last_ns = RECORD.unpack_from(self._records, at)
+            at += RECORD.size
+            self.packets.append((PacketKind(kind), bytes(self._records[at : at + size]), last_ns))
+            at += size
+        self._used[:] = bytes(8)
+
+
+class ScriptHost(EngineHost):
+    """The reader of a `Bus`, by the kernel if it can."""
+
+    def __init__(self, way):
+        protocol = 1.0 if MODELS[way] in ("AX-12A", "MX-28") else 2.0
+        self.dialect = protocol1 if protocol == 1.0 else protocol2
+        ports, clock = self.open()
+        session = Session(ports, clock, line_plan("line", 1_000_000, protocol, 0), lambda: None)
+        session.log.recording = self.sink = DeskLog()
+        self.lines = session.lines
+        table = find_table(MODELS[way], protocol)
+        if not way.startswith("fast"):
+            table = replace(table, capabilities=table.capabilities - {"fast_sync_read"})
+        servos = ServoSet(ServoGroup(session, [Addressed(servo_id, table) for servo_id in IDS]))
+        self.read = servos.reader("present_position", table.present_speed_item, table.effort_item)
+        assert way in ("single reads", self.read.instructions)
+
+    @property
+    def reading(self):
+        return self.read._reading
+
+    def reads(self):
+        reads = self.reading.reads
+        cycle = reads.plan() if reads.stale else reads.cycle
+        return [reads._in_length(one.patient, one.group) for one in cycle.queue]
+
+    def exchange(self, given):
+        self.sink.packets.clear()
+        self.say(given)
+        return self.read().valid.tolist()
+
+    def check_reader(self, by_kernel):
+        assert self.reading.by_kernel == by_kernel
+
+    @property
+    def errors(self):
+        return self.reading.reads.errors
+
+
 class TestVirtualTime(SpoiltReplies):
     host = EngineHost
+
+
+class TestScript(SpoiltReplies):
+    host = ScriptHost
 
 
 class TestRealTime(GoodReplies):

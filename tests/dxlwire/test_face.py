@@ -4,43 +4,17 @@ from __future__ import annotations
 
 import ast
 import doctest
-import os
-import pty
-import re
 import subprocess
 import sys
-import threading
-import tty
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 import dxlwire
-from dxlwire import dialect_of
 
 README = Path(dxlwire.__file__).with_name("README.md")
 OWN = Path(__file__).parent
 KIT = [OWN.parent / f"kit/{name}.py" for name in ("cases", "exchanges", "plans")]
-
-
-@pytest.fixture
-def servo() -> Iterator[str]:
-    """Path of a line with one servo that answers every request with position 1024."""
-    ours, theirs = pty.openpty()
-    tty.setraw(theirs)
-    reply = dialect_of(2.0).status_packet(1, 0, (1024).to_bytes(4, "little"))
-
-    def answer() -> None:
-        if os.read(ours, 64) == bytes.fromhex("ff ff fd 00 01 07 00 02 84 00 04 00 1d 15"):
-            os.write(ours, reply)
-
-    thread = threading.Thread(target=answer, daemon=True)
-    thread.start()
-    yield os.ttyname(theirs)
-    os.close(theirs)
-    thread.join(10)
-    os.close(ours)
 
 
 def test_every_public_name_exists() -> None:
@@ -57,13 +31,6 @@ def test_examples_of_docstring_and_readme_are_right() -> None:
     result = doctest.testfile(str(README), module_relative=False)
     assert result.failed == 0
     assert result.attempted > 5
-
-
-def test_example_reads_a_position(servo: str, capsys: pytest.CaptureFixture[str]) -> None:
-    code = re.findall(r"```python\n(import.*?)```", README.read_text(), re.DOTALL)[-1]
-    exec(code.replace("/dev/ttyUSB0", servo), {})  # noqa: S102  the README of this repository
-    value, unit = capsys.readouterr().out.split()
-    assert (round(float(value), 4), unit) == (1.5708, "rad")
 
 
 def test_import_loads_neither_numpy_nor_dxlrun() -> None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import struct
+from itertools import count
 
 import msgspec
 import numpy as np
@@ -51,7 +52,7 @@ def devices(*wanted, first=101, capabilities=ALL):
     line = Line(1_000_000, 0, 500_000, protocol2)
     found, column = [], 0
     for index, names in enumerate(wanted):
-        blocks = device_blocks(line, table, {name: table.items[name] for name in names}, column)
+        blocks = device_blocks(line, table, {name: table.items[name] for name in names}, count(column))
         column += len(names)
         plan = DevicePlan(f"device_{index}", first + index, table.model, 1060, index, blocks)
         found.append((plan, table))
@@ -310,7 +311,7 @@ def test_protocol_1_reads_each_device_by_itself_and_keeps_the_chain_of_servos():
         "[items]\nvoltage = {address = 42, size = 1, access = 'R', tick = '1/10 V'}\n"
     )
     blocks = device_blocks(
-        Line(1_000_000, 0, 500_000, protocol1), table, {"voltage": table.items["voltage"]}, 0
+        Line(1_000_000, 0, 500_000, protocol1), table, {"voltage": table.items["voltage"]}, [0]
     )
     plan = DevicePlan("board", 200, "AX-12A", 12, 0, blocks)
     rig = start_rig(make_plan((1, 2), devices=[(plan, table)], models=["MX-28", "MX-28"]))

@@ -30,9 +30,10 @@ from dxlrun.errors import PortError, StartUpError
 from dxlrun.features import FEATURES
 from dxlrun.plan.loop_plan import ServoLimit
 from dxlwire.exchange.bus_engine import LATE_NS, NEVER, BusEngine, Lines
+from dxlwire.exchange.cyclic_exchange import CyclicExchange
 from dxlwire.exchange.cyclic_reads import MOST_BROKEN
 from dxlwire.exchange.idle import LEAST_MARGIN_NS, IdleScheduler
-from dxlwire.exchange.kernel import AWAITING, Answer, Kernel, KernelGoals
+from dxlwire.exchange.kernel import Answer, Kernel, KernelGoals
 from dxlwire.exchange.samples import Samples
 from dxlwire.packets import PacketLog
 from dxlwire.plan.retry import limit_patience, pause
@@ -140,6 +141,7 @@ class DynamixelHardware:
         shared = [KernelGoals(one.goals, one.life.torqued, one.life.ceiling) for one in self._servos]
         self._kernel = Kernel(self._lines, shared, self._samples, goals.values, packets)
         self._read, self._write = self._kernel.read, self._kernel.write
+        self._exchange = CyclicExchange(self._lines, [one.reads for one in self._servos], self._kernel)
         self._start_up = StartUp(self._lines, self._servos, events, parts.features)
         self.servo_limits: Mapping[int, Sequence[ServoLimit]] = {}
 
@@ -195,7 +197,7 @@ class DynamixelHardware:
 
     def _prepare_read(self) -> None:
         if self._by_kernel is None:
-            self._by_kernel = self._plan_reads()
+            self._by_kernel = self._exchange.plan_reads()
         now_ns = self._clock.now_ns()
         for servos in self._servos:
             servos.watchdogs.sent(now_ns)
@@ -220,7 +222,7 @@ class DynamixelHardware:
         if answer is Answer.UNEXPECTED:
             self._look = True
             if self._by_kernel:
-                self._interrupt()
+                self._exchange.interrupt_kernel()
             self._parse()
         else:
             for bus, servos in self._pairs:
@@ -240,46 +242,9 @@ class DynamixelHardware:
             if servos.life.torque_changed:
                 servos.show_torque(self._states.torque)
 
-    def _plan_reads(self) -> bool:
-        """Plan the reads of the next cycle, before any of them is sent.
-
-        Returns:
-            True if the kernel can do the reads: every open line has a program for it.
-        """
-        kernel, ready = self._kernel, True
-        for index, (bus, servos) in enumerate(self._pairs):
-            cycle = servos.reads.plan() if servos.reads.stale else servos.reads.cycle
-            program = cycle.program
-            if bus.failure is None:
-                known = program is not None and program is kernel.programs[index]
-                ready &= known or (program is not None and kernel.plan(index, program))
-                # Leave the beginning of an unfinished packet to the parser.
-                ready &= not bus.receiver.pending
-        return ready
-
-    def _interrupt(self) -> None:
-        for index, (bus, servos) in enumerate(self._pairs):
-            line, failure = self._kernel.line(index)
-            if bus.failure is not None:
-                continue
-            if failure is not None:
-                bus.mark_lost(failure)
-            if line.done or line.state or failure is not None:
-                servos.reads.begin_cycle(line.done)
-                bus.load_job(servos.reads, cyclic=True)
-            if line.state == AWAITING:
-                bus.await_replies(line.at_ns, line.sent_ns, line.deadline_ns)
-            for data, at_ns in self._kernel.pieces(index):
-                bus.parse_bytes(data, at_ns)
-        self._kernel.abandon()
-
     def _parse(self) -> None:
         """Read packet by packet the lines that were not read yet in this cycle."""
-        waiting = [(bus, servos) for bus, servos in self._pairs if not servos.reads.begun]
-        self._lines.discard_input([bus for bus, _ in waiting])
-        for bus, servos in waiting:
-            servos.reads.begin_cycle()
-            bus.load_job(servos.reads, cyclic=True)
+        self._exchange.load_reads()
         self._lines.pump()
         for servos in self._servos:
             self._settle(servos)
@@ -318,7 +283,7 @@ class DynamixelHardware:
             all(servos.at_rest for servos in self._servos)
             and all(least_ns for _, least_ns in self._waiting)
             and self._states.mode.tobytes() == self._samples.modes
-            and self._plan_reads()
+            and self._exchange.plan_reads()
         ) or None
         self._look = self._by_kernel is None
 
@@ -420,7 +385,7 @@ class DynamixelHardware:
         if working:
             self._lines.discard_input(self._buses)
             self._lines.pump()
-        self._by_kernel = self._plan_reads()  # Plan here, where no deadline is near.
+        self._by_kernel = self._exchange.plan_reads()  # Plan here, where no deadline is near.
 
     def stop(self) -> tuple[str, ...]:
         """Switch torque off on every servo, read it back, and make the features' outputs safe; return a

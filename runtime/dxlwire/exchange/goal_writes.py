@@ -152,6 +152,7 @@ class SyncWrite(msgspec.Struct, frozen=True):
     rows: tuple[int, ...]
     ids: tuple[int, ...]
     cells: tuple[list[GoalCell], ...]  # Goal items of each servo, in the order of the wire
+    always: bool = False  # Send every goal in every call, changed or not
 
 
 def _cells(

@@ -106,7 +106,8 @@ typedef struct { /* goals.SyncWrite */
     uint8_t *served; /* 1 if the servo could get a goal in the previous cycle */
     int64_t *sent_at;
     int64_t cycle;
-    int32_t count, items, address, length, lead, unused;
+    int32_t count, items, address, length, lead;
+    int32_t always; /* 1: every goal is sent by every call, changed or not */
 } SyncWrite;
 
 typedef struct {
@@ -816,7 +817,7 @@ static int32_t build(Kernel *k, const Line *l, SyncWrite *w, uint8_t *packet)
         changed |= served && !w->served[m];
         w->served[m] = served;
         /* A changed goal is sent in two cycles, because the first packet may be lost without notice. */
-        int due = served && (changed || w->again[m] || w->sent_at[m] <= cycle - REPEATED);
+        int due = served && (changed || w->always || w->again[m] || w->sent_at[m] <= cycle - REPEATED);
         w->again[m] = changed;
         if (!due)
             continue;

@@ -12,6 +12,7 @@ from ctypes import POINTER, c_int32, c_int64, c_uint8, c_void_p
 from enum import IntEnum, unique
 from functools import partial
 from pathlib import Path
+from typing import Protocol
 
 import msgspec
 import numpy as np
@@ -23,7 +24,7 @@ from dxlwire.exceptions import PortError
 from dxlwire.exchange.arrays import Floats
 from dxlwire.exchange.bus_engine import BEAT_NS, LOST_LINE_STEP_NS, NEVER, Lines
 from dxlwire.exchange.device_samples import DeviceSamples
-from dxlwire.exchange.goal_writes import GoalArrays, SyncWrite
+from dxlwire.exchange.goal_writes import SyncWrite
 from dxlwire.exchange.samples import Samples
 from dxlwire.packets import RECORD_HEADER, PacketLog
 from dxlwire.plan.line import BITS_PER_BYTE
@@ -193,10 +194,19 @@ def _fast_replies(plan: BusPlan, read: PlannedRead) -> _Replies:
     return expected, known, [_Packet(0, size, BROADCAST_ID)], parts
 
 
+class SyncWrites(Protocol):
+    """The sync writes of one bus."""
+
+    @property
+    def sync_writes(self) -> tuple[SyncWrite, ...]:
+        """The sync writes, in the order of sending; replaced as a whole when one changes."""
+        ...
+
+
 class KernelGoals(msgspec.Struct, frozen=True):
     """Goals of one bus, with arrays that the exchange kernel reads without a copy."""
 
-    arrays: GoalArrays
+    arrays: SyncWrites
     included: NDArray[np.bool_]  # True for each servo that may get goals
     ceiling: Floats  # Speed limit of each servo toward a position, rad/s; NaN: no limit
 
@@ -211,6 +221,8 @@ class Kernel:
         samples: Samples,
         goals: Floats,
         packets: PacketLog,
+        *,
+        plans: Sequence[BusPlan] = (),
     ) -> None:
         """Pass plans, arrays and ports of all lines to the compiled kernel.
 
@@ -220,9 +232,11 @@ class Kernel:
             samples: States to fill.
             goals: Shape (4, joints), one row for each of COMMAND_INTERFACES; NaN: no goal.
             packets: Log of the exchanged packets.
+            plans: One for each line; empty: those of `lines`.
         """
         self._library = library()
         self._buses = lines.buses
+        plans = plans or lines.plans
         self._shared = tuple(shared)
         self._packets = packets
         self._ports = lines.ports
@@ -236,9 +250,9 @@ class Kernel:
         self._writes: list[tuple[SyncWrite, ...]] = [()] * len(shared)
         self._written: list[object] = [None] * len(shared)
         self._kernel = STRUCTS["Kernel"](beat_ns=BEAT_NS)
-        self._lines = self._laid_lines()
-        self._lay_states(lines.plans, samples, goals)
-        self._lay_devices(lines.plans, samples.devices)
+        self._lines = self._laid_lines(plans)
+        self._lay_states(plans, samples, goals)
+        self._lay_devices(plans, samples.devices)
         self._lay_ports()
         desk = packets.desk
         self._room = NEVER
@@ -256,11 +270,12 @@ class Kernel:
         self.write: Callable[[], int] = partial(self._library.dxl_write, self._pointer)
         """Send the goals that are due, in C. Returns 0, or a code for `finish_write`."""
 
-    def _laid_lines(self) -> ctypes.Array[ctypes.Structure]:
+    def _laid_lines(self, plans: Sequence[BusPlan]) -> ctypes.Array[ctypes.Structure]:
         lines = (STRUCTS["Line"] * max(len(self._buses), 1))()
         first = first_block = 0
-        for index, (line, bus, shared) in enumerate(zip(lines, self._buses, self._shared, strict=False)):
-            plan = bus.plan
+        for index, (line, bus, plan, shared) in enumerate(
+            zip(lines, self._buses, plans, self._shared, strict=False)
+        ):
             line.included = shared.included.ctypes.data
             line.ceiling = shared.ceiling.ctypes.data
             line.buffer = ctypes.addressof(self._buffers[index])
@@ -521,6 +536,7 @@ def _laid_write(write: SyncWrite) -> tuple[ctypes.Structure, list[object]]:
         address=write.layout.address,
         length=write.layout.length,
         lead=write.lead,
+        always=write.always,
         cells=ctypes.addressof(cells),
         **{name: array.ctypes.data for name, array in arrays.items()},
     )

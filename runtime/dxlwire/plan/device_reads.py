@@ -1,19 +1,19 @@
-"""Device reads: chooses the blocks of bytes that are read from a device in each cycle."""
+"""Device reads: chooses the blocks of bytes that are read from a device, or from a servo of a script, in each
+cycle."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 from dxlwire.bus_plan import DeviceBlock, DeviceField, Field
-from dxlwire.control_table.control_items import ControlItem
-from dxlwire.control_table.device_table import DeviceTable
+from dxlwire.control_table.control_items import BaseControlTable, ControlItem
 from dxlwire.plan.line import MOST_SPARE, Line
 
 MOST_BYTES = 120  # Longest block of one read: devices have small buffers [i]
 
 
 def device_blocks(
-    line: Line, table: DeviceTable, states: Mapping[str, ControlItem], first_column: int
+    line: Line, table: BaseControlTable, states: Mapping[str, ControlItem], columns: Iterable[int]
 ) -> tuple[DeviceBlock, ...]:
     """Return the blocks by which the items of all these states are read in the shortest time, in the order of
     addresses.
@@ -23,10 +23,10 @@ def device_blocks(
     Args:
         line: Timing of the line.
         table: Control table of the device.
-        states: Item of each state, by name, in the order of their columns.
-        first_column: Column of the first state.
+        states: Item of each state, by name.
+        columns: Column of each state.
     """
-    columns = {name: first_column + index for index, name in enumerate(states)}
+    places = dict(zip(states, columns, strict=False))
     wanted = sorted(states.items(), key=lambda pair: pair[1].address)
     runs: list[list[tuple[str, ControlItem]]] = []
     for name, item in wanted:
@@ -35,10 +35,10 @@ def device_blocks(
             last.append((name, item))
         else:
             runs.append([(name, item)])
-    return tuple(_block(table, run, columns) for run in runs)
+    return tuple(_block(table, run, places) for run in runs)
 
 
-def _together(line: Line, table: DeviceTable, run: Sequence[ControlItem], item: ControlItem) -> bool:
+def _together(line: Line, table: BaseControlTable, run: Sequence[ControlItem], item: ControlItem) -> bool:
     """Return True if one read of the items in `run` and another item is at least as fast as two reads."""
     start, end = run[0].address, max(one.address + one.size for one in run)
     upto = max(end, item.address + item.size)
@@ -49,7 +49,7 @@ def _together(line: Line, table: DeviceTable, run: Sequence[ControlItem], item: 
 
 
 def _block(
-    table: DeviceTable, run: Sequence[tuple[str, ControlItem]], columns: Mapping[str, int]
+    table: BaseControlTable, run: Sequence[tuple[str, ControlItem]], columns: Mapping[str, int]
 ) -> DeviceBlock:
     start = run[0][1].address
     end = max(item.address + item.size for _, item in run)

@@ -48,6 +48,17 @@ _ADDRESS_OF_P = 512
 position control."""
 
 
+_NAMES: Mapping[str, int] = MappingProxyType(
+    {
+        "current": _CURRENT,
+        "velocity": _VELOCITY,
+        "position": _POSITION,
+        "extended_position": _EXTENDED,
+        "current_based_position": _CURRENT_BASED,
+        "pwm": _PWM,
+    }
+)
+
 LACKS: Mapping[Mode, str] = MappingProxyType(
     {
         Mode.POSITION: "has no multi-turn mode for a continuous joint",
@@ -217,6 +228,14 @@ def operating_modes(table: ControlTable) -> tuple[int, ...]:
     if "goal_current" in table.items:
         return _CURRENT, _VELOCITY, _POSITION, _EXTENDED, _CURRENT_BASED, _PWM
     return _VELOCITY, _POSITION, _EXTENDED, _PWM
+
+
+def mode_numbers(table: ControlTable) -> dict[str, int]:
+    """Return the values of Operating Mode, or of Control Mode of the XL-320, that a model supports, by name;
+    empty without that item."""
+    if "control_mode" in table.items:
+        return {"wheel": _WHEEL, "joint": _JOINT}
+    return {name: number for name, number in _NAMES.items() if number in operating_modes(table)}
 
 
 def _by_angle_limits(table: ControlTable, ends: tuple[int, int], continuous: bool) -> list[ModePlan]:

@@ -13,16 +13,14 @@ from dxlrun.output.terminal import print_warning
 
 if TYPE_CHECKING:
     from dxlwire.bus_plan import BusPlan
-    from dxlwire.packets import PacketSink
+    from dxlwire.packets import PacketLog, PacketSink
 
 TOOL_NAME = "tool"
 """Name of the log's metadata record with the `command` that wrote it."""
 
 
 @contextmanager
-def tool_log(
-    path: Path | None, command: str, buses: Sequence[str] = ("line",)
-) -> Iterator[PacketSink | None]:
+def tool_log(path: Path | None, command: str, buses: Sequence[str] = ("line",)) -> Iterator[PacketLog | None]:
     """Yield a sink that writes packets to a new log, which is closed with the block; None without a path.
 
     `buses` are the names of the lines. Raises InputError when the file exists or cannot be written.
@@ -51,6 +49,17 @@ def tool_log(
         packets.commit_packets()
         if (error_text := writer.close().error) is not None:
             print_warning(incomplete_log(error_text))
+
+
+@contextmanager
+def record_line(path: Path, line: str) -> Iterator[PacketLog]:
+    """Yield a log of the packets of a script's line, for `dxlwire.Bus.record`; it is closed with the block.
+
+    Raises InputError when the file exists or cannot be written.
+    """
+    with tool_log(path, "dxlwire.Bus", (line,)) as log:
+        assert log is not None  # noqa: S101  there is a path
+        yield log
 
 
 class BusesLog:

@@ -61,7 +61,7 @@ def compile_devices(compilation: Compilation) -> Contribution:
             model=table.model,
             model_number=table.model_number,
             source=len(sources),
-            blocks=device_blocks(_line(bus), table, read, states),
+            blocks=device_blocks(_line(bus), table, read, count(states)),
         )
         columns = count(len(commands))
         own = {each: DeviceCommand.build(each, item, next(columns)) for each, item in written.items()}

@@ -1,0 +1,197 @@
+"""Asyncio bus: the same servos for an asyncio program. The event loop waits for the replies, no thread."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dxlwire.bus.blocking_bus import RATE
+from dxlwire.bus.programs import find_ids, identify
+from dxlwire.bus.repeated_exchange import Reading, ServoStates, Writing
+from dxlwire.bus.servo_group import ServoGroup, Values, found_group, named_servos
+from dxlwire.bus.session import Session, open_session
+from dxlwire.exchange.arrays import Floats
+from dxlwire.exchange.bus_engine import NEVER
+from dxlwire.transaction import Program, ProgramJob, Result
+
+
+class _Waiting:
+    """A session whose replies are awaited by the event loop, one call at a time."""
+
+    def __init__(self, session: Session) -> None:
+        self.session = session
+        self.lock = asyncio.Lock()
+
+    async def pump(self) -> None:
+        """Execute the loaded job of the line."""
+        engine, lines = self.session.engine, self.session.lines
+        deadline_ns = engine.process_due(engine.now_ns())
+        while deadline_ns != NEVER:  # A cancelled call leaves its job, which the next one drops
+            await self._readable(deadline_ns)
+            ready = lines.ports.wait_for_bytes(0)
+            deadline_ns = engine.read_and_process() if ready else engine.process_due(engine.now_ns())
+
+    async def _readable(self, deadline_ns: int) -> None:
+        descriptors = self.session.lines.ports.descriptors
+        if descriptors is None:  # Virtual time
+            self.session.lines.ports.wait_for_bytes(deadline_ns)
+            await asyncio.sleep(0)
+            return
+        loop = asyncio.get_running_loop()
+        ready = asyncio.Event()
+        loop.add_reader(descriptors[0], ready.set)
+        try:
+            left_s = max(0, deadline_ns - self.session.engine.now_ns()) * 1e-9
+            await asyncio.wait_for(ready.wait(), left_s)
+        except TimeoutError:
+            pass
+        finally:
+            loop.remove_reader(descriptors[0])
+
+    async def run_program(self, program: Program[Result]) -> Result:
+        """Run a program to its end and return its result. Raises PortError if the line is closed or lost."""
+        session = self.session
+        async with self.lock:
+            session.check_open()
+            job = ProgramJob(program)
+            session.engine.load_job(job, waits=True)
+            session.lines.discard_input(session.lines.buses)
+            await self.pump()
+            return session.finish_program(job.result)
+
+
+class AsyncBus:
+    """A serial line with servos for an asyncio program; an async context manager. See `Bus`."""
+
+    def __init__(self, port: str, baud_rate: int = RATE, protocol: float = 2.0) -> None:
+        """Open a line; the arguments and errors are those of `Bus`."""
+        self._waiting = _Waiting(open_session(port, baud_rate, protocol))
+
+    @classmethod
+    def on_session(cls, session: Session) -> AsyncBus:
+        """Return a bus on a line that is open already, such as a simulated one on virtual time."""
+        bus = cls.__new__(cls)
+        bus._waiting = _Waiting(session)
+        return bus
+
+    async def __aenter__(self) -> AsyncBus:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the line; torque stays as it is."""
+        self._waiting.session.close()
+
+    def record(self, path: str | os.PathLike[str]) -> None:
+        """Record all packets from now on in a new log, see `Bus.record`."""
+        self._waiting.session.record(Path(path))
+
+    async def scan(self, ids: Iterable[int] | None = None) -> AsyncServoSet:
+        """Find the servos that answer at this baud rate, see `Bus.scan`."""
+        session = self._waiting.session
+        looked_for = range(session.line.dialect.HIGHEST_ID + 1) if ids is None else ids
+        there = await self._waiting.run_program(
+            find_ids(session.line, list(looked_for), session.log.answered)
+        )
+        found = await self._waiting.run_program(identify(session.line, dict.fromkeys(there)))
+        return AsyncServoSet(self._waiting, found_group(session, found))
+
+    async def servos(self, models: Mapping[int, str]) -> AsyncServoSet:
+        """Return servos by ID and model, see `Bus.servos`."""
+        session = self._waiting.session
+        found = await self._waiting.run_program(named_servos(session, models))
+        return AsyncServoSet(self._waiting, found_group(session, found))
+
+
+class AsyncServoSet:
+    """Servos of an asyncio bus, see `ServoSet`."""
+
+    def __init__(self, waiting: _Waiting, group: ServoGroup) -> None:
+        self._waiting = waiting
+        self._group = group
+
+    @property
+    def ids(self) -> tuple[int, ...]:
+        """IDs of the servos."""
+        return self._group.ids
+
+    @property
+    def models(self) -> tuple[str, ...]:
+        """Models of the servos."""
+        return self._group.models
+
+    def __getitem__(self, ids: int | Sequence[int]) -> AsyncServoSet:
+        return AsyncServoSet(self._waiting, self._group.part([ids] if isinstance(ids, int) else ids))
+
+    async def read(self, item: str, *, raw: bool = False) -> Floats:
+        """Read an item of every servo once, see `ServoSet.read`."""
+        values, failures = await self._waiting.run_program(self._group.read_values(item, raw=raw))
+        self._group.raise_failures(failures)
+        return values
+
+    async def write(self, item: str, value: Values, *, raw: bool = False) -> None:
+        """Write an item of every servo once, see `ServoSet.write`."""
+        self._group.raise_failures(
+            await self._waiting.run_program(self._group.write_values(item, value, raw=raw))
+        )
+
+    async def torque(self) -> NDArray[np.bool_]:
+        """Return True for each servo that has torque."""
+        return (await self.read("torque_enable")).astype(np.bool_)
+
+    async def switch_torque(self, on: bool) -> None:
+        """Switch torque on or off; before it is switched on, goals become the present positions."""
+        self._group.raise_failures(await self._waiting.run_program(self._group.switch_all(on)))
+
+    def reader(self, *items: str, raw: bool = False) -> AsyncServoReader:
+        """Prepare to read items again and again, see `ServoSet.reader`."""
+        reading = Reading(self._waiting.session, self._group.servos, items, raw=raw)
+        return AsyncServoReader(self._waiting, reading)
+
+    def writer(self, *items: str, raw: bool = False) -> AsyncServoWriter:
+        """Prepare to write items in RAM again and again, see `ServoSet.writer`."""
+        writing = Writing(self._waiting.session, self._group.servos, items, raw=raw)
+        return AsyncServoWriter(self._waiting, writing)
+
+
+class AsyncServoReader:
+    """Reads the same items of the same servos in each call."""
+
+    def __init__(self, waiting: _Waiting, reading: Reading) -> None:
+        self._waiting = waiting
+        self._reading = reading
+
+    async def __call__(self) -> ServoStates:
+        """Read all items of all servos, see `ServoReader`. The event loop runs while replies are awaited, so
+        the parser reads, not the kernel."""
+        session = self._waiting.session
+        async with self._waiting.lock:
+            session.check_open()
+            self._reading.begin_cycle(kernel=False)
+            try:
+                await self._waiting.pump()
+            finally:
+                self._reading.end_cycle()  # Also of a cancelled call
+            session.log.commit_packets()
+            session.check_open()
+            return self._reading.newest_state()
+
+
+class AsyncServoWriter:
+    """Writes the same items of the same servos in each call."""
+
+    def __init__(self, waiting: _Waiting, writing: Writing) -> None:
+        self._waiting = waiting
+        self._writing = writing
+
+    async def __call__(self, *values: ArrayLike) -> None:
+        """Send the values, see `ServoWriter`."""
+        async with self._waiting.lock:
+            self._writing.send_values(values)

@@ -1,0 +1,244 @@
+"""Blocking bus: servos of one serial line in a script, each call of which waits for the replies."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dxlwire.bus.programs import Addressed, Failures, find_ids, identify
+from dxlwire.bus.repeated_exchange import Reading, ServoStates, Writing
+from dxlwire.bus.servo_group import ServoGroup, Values, found_group, named_servos
+from dxlwire.bus.session import Session, open_session
+from dxlwire.exchange.arrays import Floats
+
+RATE = 57_600  # Factory setting of most servos, bit/s
+
+
+class Bus:
+    """A serial line with servos, opened exclusively; close it, or use it as a context manager.
+
+    Torque stays as it is when the line is closed, unless `limp_at_exit` is true. Threads may share a bus:
+    each call holds a lock."""
+
+    def __init__(
+        self, port: str, baud_rate: int = RATE, protocol: float = 2.0, *, limp_at_exit: bool = False
+    ) -> None:
+        """Open a line.
+
+        Args:
+            port: Device: `/dev/ttyUSB0`.
+            baud_rate: bit/s.
+            protocol: 1.0 or 2.0.
+            limp_at_exit: Switch torque off on all servos of this bus that were used, before it is closed.
+
+        Raises:
+            PortError: The port cannot be opened, or the adapter does not support the baud rate.
+            ValueError: There is no such protocol.
+        """
+        self._session = open_session(port, baud_rate, protocol)
+        self._limp_at_exit = limp_at_exit
+        self._groups: list[ServoGroup] = []
+
+    @classmethod
+    def on_session(cls, session: Session, *, limp_at_exit: bool = False) -> Bus:
+        """Return a bus on a line that is open already, such as a simulated one on virtual time."""
+        bus = cls.__new__(cls)
+        bus._session, bus._limp_at_exit, bus._groups = session, limp_at_exit, []
+        return bus
+
+    def __enter__(self) -> Bus:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the line; with `limp_at_exit` switch torque off first.
+
+        Raises:
+            ServoError: A servo did not confirm that its torque is off.
+        """
+        try:
+            for group in self._groups if self._limp_at_exit else ():
+                group.raise_failures(self._session.run_program(group.switch_all(False)))
+        finally:
+            self._session.close()
+
+    def record(self, path: str | os.PathLike[str]) -> None:
+        """Record all packets from now on in a new log, which `dxlrun analyze` reads.
+
+        Raises:
+            InputError: The file exists or cannot be written.
+            ValueError: A reader or writer exists already.
+        """
+        self._session.record(Path(path))
+
+    def scan(self, ids: Iterable[int] | None = None) -> ServoSet:
+        """Find the servos that answer at this baud rate, in the order of their IDs; None: all IDs.
+
+        Raises:
+            ServoError: There is no control table for a servo.
+        """
+        session = self._session
+        looked_for = range(session.line.dialect.HIGHEST_ID + 1) if ids is None else ids
+        with session.lock:
+            answered = session.log.answered
+            there = session.run_program(find_ids(session.line, list(looked_for), answered))
+            return self._use(session.run_program(identify(session.line, dict.fromkeys(there))))
+
+    def servos(self, models: Mapping[int, str]) -> ServoSet:
+        """Return servos by ID and model; each one is asked for its model and firmware.
+
+        Raises:
+            ServoError: A servo does not answer, or has another model.
+            LookupError: There is no such model.
+        """
+        return self._use(self._session.run_program(named_servos(self._session, models)))
+
+    def _use(self, found: tuple[list[Addressed], Failures]) -> ServoSet:
+        group = found_group(self._session, found)
+        self._groups.append(group)
+        return ServoSet(group)
+
+
+class ServoSet:
+    """Servos of one bus. Values are arrays with one element for each servo, in the order of `ids`."""
+
+    def __init__(self, group: ServoGroup) -> None:
+        self._group = group
+        self._session = group.session
+
+    @property
+    def ids(self) -> tuple[int, ...]:
+        """IDs of the servos."""
+        return self._group.ids
+
+    @property
+    def models(self) -> tuple[str, ...]:
+        """Models of the servos."""
+        return self._group.models
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def __getitem__(self, ids: int | Sequence[int]) -> ServoSet:
+        return ServoSet(self._group.part([ids] if isinstance(ids, int) else ids))
+
+    def __repr__(self) -> str:
+        return f"ServoSet({dict(zip(self.ids, self.models, strict=True))})"
+
+    def read(self, item: str, *, raw: bool = False) -> Floats:
+        """Read an item of every servo once.
+
+        Args:
+            item: Name in the control table: `present_temperature`.
+            raw: Integers of the wire instead of SI units.
+
+        Raises:
+            ServoError: ServoSet did not answer, three times each.
+            LookupError: A model has no such item.
+        """
+        values, failures = self._session.run_program(self._group.read_values(item, raw=raw))
+        self._group.raise_failures(failures)
+        return values
+
+    def write(self, item: str, value: Values, *, raw: bool = False) -> None:
+        """Write an item of every servo once, acknowledged by each. An EEPROM item is written only if it
+        differs, and only while torque is off.
+
+        Args:
+            item: Name in the control table: `operating_mode`.
+            value: One for all servos, or one for each; the operating mode has names: `position`.
+            raw: The values are integers of the wire instead of SI units.
+
+        Raises:
+            ServoError: ServoSet did not answer, refused, or have torque.
+            ValueError: A value is outside the range of the item.
+            LookupError: A model has no such item.
+        """
+        self._group.raise_failures(self._session.run_program(self._group.write_values(item, value, raw=raw)))
+
+    @property
+    def torque(self) -> NDArray[np.bool_]:
+        """True for each servo that has torque; read from the servos. Set it to switch torque.
+
+        Before torque is switched on, the goal of each servo becomes its present position."""
+        return self.read("torque_enable").astype(np.bool_)
+
+    @torque.setter
+    def torque(self, on: bool) -> None:
+        self._group.raise_failures(self._session.run_program(self._group.switch_all(bool(on))))
+
+    def reader(self, *items: str, raw: bool = False) -> ServoReader:
+        """Prepare to read items again and again, by the fastest instruction that all servos have.
+
+        Raises:
+            LookupError: A model has no such item.
+        """
+        with self._session.lock:
+            return ServoReader(Reading(self._session, self._group.servos, items, raw=raw))
+
+    def writer(self, *items: str, raw: bool = False) -> ServoWriter:
+        """Prepare to write items in RAM again and again, by sync write.
+
+        Raises:
+            LookupError: A model has no such item.
+            ValueError: An item is read-only or in the EEPROM.
+        """
+        with self._session.lock:
+            return ServoWriter(Writing(self._session, self._group.servos, items, raw=raw))
+
+
+class ServoReader:
+    """Reads the same items of the same servos in each call."""
+
+    def __init__(self, reading: Reading) -> None:
+        self._reading = reading
+        self._session = reading.session
+
+    def __call__(self) -> ServoStates:
+        """Read all items of all servos; a lost reply makes its servo invalid and raises nothing.
+
+        Raises:
+            PortError: The line is lost.
+        """
+        session, reading = self._session, self._reading
+        with session.lock:
+            session.check_open()
+            if reading.begin_cycle():
+                try:
+                    session.lines.pump()
+                finally:
+                    reading.end_cycle()  # Also after a KeyboardInterrupt
+                session.check_open()
+            session.log.commit_packets()
+            return reading.newest_state()
+
+    @property
+    def instructions(self) -> str:
+        """Instructions of one call in the e-Manual's words: `fast sync read`."""
+        return self._reading.read_by
+
+
+class ServoWriter:
+    """Writes the same items of the same servos in each call."""
+
+    def __init__(self, writing: Writing) -> None:
+        self._writing = writing
+        self._lock = writing.session.lock
+
+    def __call__(self, *values: ArrayLike) -> None:
+        """Send the values, one argument for each item: a number for all servos, or one for each. Values are
+        limited to the item's range; a servo whose first value is NaN gets nothing.
+
+        No servo acknowledges a sync write.
+
+        Raises:
+            PortError: The line is lost.
+        """
+        with self._lock:
+            self._writing.send_values(values)

@@ -1,0 +1,204 @@
+"""Programs: the single transactions of a script: find servos, read and write items, switch torque.
+
+Programs of one servo raise `ServoFailed`. Reads and pings are repeated. A write is not: after a lost
+acknowledgement the item is read back, which shows whether the servo has executed the write."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+import msgspec
+from msgspec.structs import replace
+
+from dxlwire.bus_plan import Field, ModePlan
+from dxlwire.control_table import ControlItem, ControlTable, models_by_number
+from dxlwire.exceptions import FailureKind, ServoFailure
+from dxlwire.exchange.goal_writes import LEADS
+from dxlwire.modes import Mode
+from dxlwire.plan.line import Line, listen_transaction
+from dxlwire.plan.mode_plan import in_mode, mode_plans
+from dxlwire.plan.retry import retry
+from dxlwire.transaction import BROADCAST_ID, Program, Reply, TransactionOutcome
+
+SHORT_TIMEOUT_NS = 3_000_000
+"""Time (ns) that a ping which is probably not answered waits, beyond the latest arrival by the wire."""
+SLOT_NS = 3_000_000
+"""Time (ns) for each ID after a broadcast ping, in addition to the bytes of its answer (dynamixel-sdk,
+broadcastPing)."""
+_FIELDS: Mapping[str, str] = {"position": "position", "velocity": "speed", "effort": "effort", "pwm": "pwm"}
+_MODE_REGISTERS = (
+    "operating_mode",
+    "control_mode",
+    "cw_angle_limit",
+    "ccw_angle_limit",
+    "torque_ctrl_mode_enable",
+)
+
+
+class Addressed(msgspec.Struct, frozen=True):
+    """A servo on the line: its ID, and the control table of its model and firmware."""
+
+    servo_id: int
+    table: ControlTable
+
+
+class ServoFailed(Exception):
+    """A program of one servo ends, because of this failure."""
+
+    def __init__(self, failure: ServoFailure) -> None:
+        super().__init__(failure.text)
+        self.failure = failure
+
+
+Failures = dict[int, ServoFailure]
+
+
+def find_ids(line: Line, ids: Sequence[int], answered: set[int]) -> Program[list[int]]:
+    """Return the IDs that answer a ping.
+
+    Protocol 2.0 gets one broadcast ping, which each servo answers in its own slot. Protocol 1.0 is pinged ID
+    by ID.
+
+    Args:
+        line: Timing of the line.
+        ids: The IDs to look for.
+        answered: IDs of the replies on the line; the caller adds each one that arrives.
+    """
+    dialect = line.dialect
+    answered.clear()
+    if dialect.PROTOCOL == 2.0:
+        slot_ns = line.wire_ns(dialect.OVERHEAD + dialect.PING_LENGTH) + SLOT_NS
+        ping = line.unanswered(dialect.ping(BROADCAST_ID))
+        slots_ns = slot_ns * (max(ids, default=0) + 2) + line.latency_ns
+        yield replace(ping, due_ns=ping.due_ns + slots_ns)
+        return sorted(answered & set(ids))
+    for servo_id in ids:
+        ping = line.ping(servo_id)
+        yield replace(ping, timeout_ns=ping.due_ns + line.latency_ns + SHORT_TIMEOUT_NS)
+    yield listen_transaction(line.latency_ns + SHORT_TIMEOUT_NS)
+    return sorted(answered & set(ids))
+
+
+def identify(
+    line: Line, models: Mapping[int, ControlTable | None]
+) -> Program[tuple[list[Addressed], Failures]]:
+    """Return the servos with these IDs, and the failures of those that are absent or have another model.
+
+    Args:
+        line: Timing of the line.
+        models: Table of the expected model by ID; None: any model.
+    """
+    found: list[Addressed] = []
+    failures: Failures = {}
+    for servo_id, expected in models.items():
+        ping = yield from retry(line.ping(servo_id))
+        reply = ping
+        if ping.answered and line.dialect.PROTOCOL == 1.0:
+            reply = yield from retry(line.read_range(servo_id, 0, 3))
+        if not reply.answered:
+            failures[servo_id] = failure_of(line, reply, "the ping")
+            continue
+        number, firmware = reply.word(), reply.parameters[2]
+        if expected is not None and number != expected.model_number:
+            others = models_by_number(number, line.dialect.PROTOCOL, firmware)
+            actual = others[0].model if others else f"a model with the number {number}"
+            failures[servo_id] = ServoFailure("wrong_model", f"is {actual}, not {expected.model}")
+            continue
+        table = expected or next(iter(models_by_number(number, line.dialect.PROTOCOL, firmware)), None)
+        if table is None:
+            text = f"has the model number {number}, for which there is no control table"
+            failures[servo_id] = ServoFailure("unknown_model", text)
+            continue
+        known = table.with_firmware(firmware)
+        fast = known.fast_sync_read_firmware
+        if fast is None or firmware < fast:
+            known = replace(known, capabilities=known.capabilities - {"fast_sync_read"})
+        found.append(Addressed(servo_id, known))
+    return found, failures
+
+
+def read_item(line: Line, servo_id: int, item: ControlItem) -> Program[bytes]:
+    """Read one item; return its bytes."""
+    reply = yield from retry(line.read_range(servo_id, item.address, item.size))
+    if not reply.answered:
+        raise ServoFailed(failure_of(line, reply, f"the read of {item.title}"))
+    return bytes(reply.parameters)
+
+
+def write_item(line: Line, servo: Addressed, item: ControlItem, data: bytes) -> Program[None]:
+    """Write one item. An EEPROM item is written only if it differs, and only while torque is off."""
+    if item.area == "EEPROM":
+        if (yield from read_item(line, servo.servo_id, item)) == data:
+            return
+        if any((yield from read_item(line, servo.servo_id, servo.table.items["torque_enable"]))):
+            text = f"has torque, so {item.title} in its EEPROM was not written; switch torque off first"
+            raise ServoFailed(ServoFailure("torque_on", text))
+    reply = yield line.write_range(servo.servo_id, item.address, data)
+    if reply.answered:
+        return
+    failure = failure_of(line, reply, f"the write of {item.title}")
+    if reply.outcome is TransactionOutcome.REFUSED:
+        raise ServoFailed(failure)
+    # Whether the servo has executed the write is unknown.
+    present = yield from retry(line.read_range(servo.servo_id, item.address, item.size))
+    if not present.answered:
+        raise ServoFailed(failure)
+    if (found := bytes(present.parameters)) != data:
+        text = f"has not executed the write of {item.title}: it still contains {item.decode(found)}"
+        raise ServoFailed(ServoFailure("not_written", text))
+
+
+def switch_torque(line: Line, servo: Addressed, on: bool) -> Program[None]:
+    """Switch the torque of a servo on or off.
+
+    Before torque is switched on, the goal becomes the present position, or zero in a mode without a position
+    goal. An old goal would otherwise move the servo at once."""
+    enable = servo.table.items["torque_enable"]
+    if on:
+        if any((yield from read_item(line, servo.servo_id, enable))):
+            return
+        yield from _reset_goal(line, servo)
+    yield from write_item(line, servo, enable, bytes((on,)))
+
+
+def _reset_goal(line: Line, servo: Addressed) -> Program[None]:
+    items = servo.table.items
+    found: dict[str, int] = {}
+    for name in _MODE_REGISTERS:
+        if (item := items.get(name)) is not None:
+            found[name] = item.integer((yield from read_item(line, servo.servo_id, item)))
+    plan = _mode_in(servo.table, found)
+    lead = "position" if plan is None else LEADS.get(plan.mode, "position")
+    if plan is None or lead == "position":
+        position = yield from read_item(line, servo.servo_id, items["present_position"])
+        # This write switches torque on in Protocol 1.0.
+        yield from write_item(line, servo, items["goal_position"], position)
+        return
+    address, place = _lead_field(plan, lead)
+    goal = next(item for item in items.values() if item.address == address + place.offset)
+    yield from write_item(line, servo, goal, bytes(goal.size))
+
+
+def _mode_in(table: ControlTable, found: Mapping[str, int]) -> ModePlan | None:
+    """Return the mode that registers select; None for extended position control, or an unknown mode."""
+    plans: Iterable[ModePlan] = mode_plans(table, table.min_tick, table.max_tick, False)
+    return next((plan for plan in plans if in_mode(plan, found) and plan.mode is not Mode.UNKNOWN), None)
+
+
+def _lead_field(plan: ModePlan, lead: str) -> tuple[int, Field]:
+    """Return the address of the block with a mode's leading goal, and the field of the goal in it."""
+    for layout in plan.goals:
+        place: Field | None = getattr(layout, _FIELDS[lead])
+        if place is not None:
+            return layout.address, place
+    raise LookupError(f"mode {plan.mode.name} has no goal {lead}")
+
+
+def failure_of(line: Line, reply: Reply, request: str) -> ServoFailure:
+    """Return the failure that an unsuccessful reply stands for; `request` names what was sent."""
+    if reply.outcome is TransactionOutcome.REFUSED:
+        return ServoFailure("refused", f"refused {request}: {line.dialect.describe_error(reply.error)}")
+    kind: FailureKind = "no_reply"
+    if reply.outcome is TransactionOutcome.GARBLED:
+        return ServoFailure(kind, f"answered {request} with garbled bytes; look for two servos with one ID")
+    return ServoFailure(kind, f"did not answer {request}")

@@ -1,0 +1,318 @@
+"""Repeated exchange: a reader and a writer, which exchange the same items of the same servos again and again.
+
+Both use the exchange of the runtime. To the compiled kernel the servos of a reader are devices: units with
+any number of items, without joint or mode. A writer is one sync write for each block of adjacent items."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import msgspec
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dxlwire.bus.item_values import item_of, tick_range
+from dxlwire.bus.programs import Addressed
+from dxlwire.bus.session import Session
+from dxlwire.bus_plan import BusPlan, DevicePlan, GoalLayout, members_of
+from dxlwire.control_table import ControlItem
+from dxlwire.exchange.arrays import Floats
+from dxlwire.exchange.cyclic_exchange import CyclicExchange
+from dxlwire.exchange.cyclic_reads import CyclicReads
+from dxlwire.exchange.goal_writes import GoalCell, SyncWrite
+from dxlwire.exchange.kernel import Answer, Kernel, KernelGoals
+from dxlwire.exchange.reports import Reason
+from dxlwire.exchange.samples import Samples
+from dxlwire.modes import COMMAND_INTERFACES
+from dxlwire.plan.device_reads import device_blocks
+from dxlwire.plan.line import TIMEOUT_MARGIN_NS
+from dxlwire.plan.mode_plan import field
+from dxlwire.plan.planning import goal_parts
+from dxlwire.plan.reads import choose_reads, read_budget, read_by
+
+_HIGHEST_TICK = (1 << 31) - 1  # Ticks of the kernel have 32 bits
+
+
+class ServoStates:
+    """Values of one read, with one element for each servo in the order of `ids`.
+
+    An item is an attribute under its name, with or without `present_`: `state.position`,
+    `state.goal_position`. A servo that did not answer keeps its last values, NaN before the first."""
+
+    __slots__ = ("_age_ns", "_items", "_values", "ids", "valid")
+
+    def __init__(
+        self,
+        items: dict[str, int],
+        ids: tuple[int, ...],
+        values: Floats,
+        valid: NDArray[np.bool_],
+        age_ns: NDArray[np.int64],
+    ) -> None:
+        self._items = items
+        self._values = values
+        self._age_ns = age_ns
+        self.ids = ids
+        self.valid = valid  # True for each servo that answered
+
+    @property
+    def age(self) -> Floats:
+        """Age of the values, seconds; NaN before the first reply."""
+        return np.where(self._age_ns < 0, np.nan, self._age_ns * 1e-9)
+
+    def __getattr__(self, name: str) -> Floats:
+        try:
+            values: Floats = self._values[self._items[name]]
+        except KeyError:
+            raise AttributeError(f"this reader has no item {name!r}") from None
+        return values
+
+    def __getitem__(self, item: str) -> Floats:
+        return self.__getattr__(item)
+
+    def __repr__(self) -> str:
+        return (
+            f"ServoStates({', '.join(self._items)}; {np.count_nonzero(self.valid)} of {len(self.ids)} valid)"
+        )
+
+
+class _Joints(msgspec.Struct):
+    """States of joints, of which a script has none; implements `JointArrays`."""
+
+    position: Floats = msgspec.field(default_factory=lambda: np.empty(0))
+    velocity: Floats = msgspec.field(default_factory=lambda: np.empty(0))
+    effort: Floats = msgspec.field(default_factory=lambda: np.empty(0))
+    valid: NDArray[np.bool_] = msgspec.field(default_factory=lambda: np.empty(0, dtype=np.bool_))
+    age_ns: NDArray[np.int64] = msgspec.field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    mode: NDArray[np.uint8] = msgspec.field(default_factory=lambda: np.empty(0, dtype=np.uint8))
+
+
+class _Rows(msgspec.Struct):
+    """States of the servos of a reader; implements `SourceArrays`."""
+
+    values: Floats
+    valid: NDArray[np.bool_]
+    age_ns: NDArray[np.int64]
+
+
+class _NoReports:
+    """Report sink of a script, in which every lost value is marked as invalid."""
+
+    def report(self, reason: Reason, source: str, text: str) -> None:
+        """Discard a report."""
+
+
+class _Writes(msgspec.Struct):
+    sync_writes: tuple[SyncWrite, ...] = ()
+
+
+class Reading:
+    """The exchange of one reader, without its wait for replies."""
+
+    def __init__(
+        self, session: Session, servos: Sequence[Addressed], items: Sequence[str], *, raw: bool
+    ) -> None:
+        if not items:
+            raise ValueError("name at least one item")
+        session.cycles += 1
+        count = len(servos)
+        self.session = session
+        self.ids = tuple(servo.servo_id for servo in servos)
+        self._items = {name: index for index, name in enumerate(items)}
+        self._items |= {name.removeprefix("present_"): index for name, index in self._items.items()}
+        self._values: Floats = np.full((len(items), count), np.nan)
+        self._arrays = _Rows(
+            self._values.reshape(-1), np.zeros(count, np.bool_), np.full(count, -1, np.int64)
+        )
+        plan = _read_plan(session, servos, items, raw)
+        self._samples = Samples([plan], _Joints(), self._arrays, _NoReports())
+        self.reads = CyclicReads(plan, self._samples.buses[0], session.engine.owed)
+        self.kernel = _kernel(session, plan, self._samples, _Writes())
+        self.exchange = CyclicExchange(session.lines, [self.reads], self.kernel)
+        self.by_kernel = False
+        self.read_by = plan.read_by  # Instructions of a cycle in the e-Manual's words
+
+    def begin_cycle(self, *, kernel: bool = True) -> bool:
+        """Read by the kernel if it can; otherwise load the reads for `Lines.pump`, and return True."""
+        if self.reads.stale or not self.by_kernel:
+            self.by_kernel = self.exchange.plan_reads() and kernel
+        code = self.kernel.read() if self.by_kernel else Answer.UNEXPECTED
+        if not code:
+            return False
+        answer = self.kernel.finish_read(code)
+        if answer is Answer.LOOK:
+            self._samples.accept_plausible(self.session.lines.clock.now_ns())
+        if answer is not Answer.UNEXPECTED:
+            return False
+        if self.by_kernel:
+            self.exchange.interrupt_kernel()
+        self.exchange.load_reads()
+        return True
+
+    def end_cycle(self) -> None:
+        """End a cycle that the parser has read."""
+        self.by_kernel = False
+        reads = self.reads
+        for member in range(len(reads.missed)):
+            arrived = self._samples.buses[0].arrived(member)
+            reads.missed[member] = 0 if arrived else reads.missed[member] + 1
+        reads.end_cycle()
+        reads.given_up.clear()
+        self._samples.fill_states(self.session.lines.clock.now_ns())
+
+    def newest_state(self) -> ServoStates:
+        """Return the values of the newest cycle."""
+        arrays = self._arrays
+        return ServoStates(
+            self._items, self.ids, self._values.copy(), arrays.valid.copy(), arrays.age_ns.copy()
+        )
+
+
+class Writing:
+    """The sync writes of one writer."""
+
+    def __init__(
+        self, session: Session, servos: Sequence[Addressed], items: Sequence[str], *, raw: bool
+    ) -> None:
+        if not 1 <= len(items) <= len(COMMAND_INTERFACES):
+            raise ValueError(f"name one to {len(COMMAND_INTERFACES)} items; {len(items)} were given")
+        session.cycles += 1
+        self.session = session
+        count = len(servos)
+        self._goals: Floats = np.full((len(COMMAND_INTERFACES), count), np.nan)
+        self._count = len(items)
+        samples = Samples([session.plan], _Joints(), _Rows(np.empty(0), *_empty()), _NoReports())
+        self._writes = _Writes(_sync_writes(session, servos, items, raw))
+        self._kernel = _kernel(session, session.plan, samples, self._writes, self._goals)
+        self._kernel.plan_writes()
+
+    def send_values(self, values: Sequence[ArrayLike]) -> None:
+        """Send one packet for each block of items, which no servo acknowledges.
+
+        Raises:
+            PortError: The line is lost.
+        """
+        if len(values) != self._count:
+            raise TypeError(f"this writer takes {self._count} values, one for each item; got {len(values)}")
+        for row, value in enumerate(values):
+            self._goals[row] = value
+        session = self.session
+        session.check_open()
+        if code := self._kernel.write():
+            for failure in self._kernel.finish_write(code).values():
+                session.engine.mark_lost(failure)
+            session.check_open()
+        session.log.commit_packets()
+
+
+def _empty() -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+    return np.empty(0, np.bool_), np.empty(0, np.int64)
+
+
+def _kernel(
+    session: Session, plan: BusPlan, samples: Samples, writes: _Writes, goals: Floats | None = None
+) -> Kernel:
+    count = 0 if goals is None else goals.shape[1]
+    shared = KernelGoals(writes, np.ones(count, np.bool_), np.full(count, np.nan))
+    if goals is None:
+        goals = np.empty((len(COMMAND_INTERFACES), 0))
+    return Kernel(session.lines, [shared], samples, goals, session.log, plans=[plan])
+
+
+def _read_plan(session: Session, servos: Sequence[Addressed], items: Sequence[str], raw: bool) -> BusPlan:
+    """Return the plan by which a reader reads the servos, each as a device."""
+    count = len(servos)
+    devices = []
+    for row, servo in enumerate(servos):
+        wanted = {name: _unscaled(item_of(servo.table, name), raw) for name in items}
+        columns = range(row, len(items) * count, count)
+        blocks = device_blocks(session.line, servo.table, wanted, columns)
+        name = f"ID {servo.servo_id}"
+        devices.append(DevicePlan(name, servo.servo_id, servo.table.model, None, row, blocks))
+    members = members_of((), devices)
+    able = [
+        servo.table.capabilities for servo, device in zip(servos, devices, strict=True) for _ in device.blocks
+    ]
+    reads = choose_reads(session.line, members, able, ())
+    return msgspec.structs.replace(
+        session.plan,
+        groups=reads.groups,
+        reads=reads.plain,
+        budget=read_budget(session.line, reads.chosen, ()),
+        fast=reads.fast,
+        read_by=read_by(session.plan.protocol, members, reads),
+        devices=tuple(devices),
+        device_margin_ns=TIMEOUT_MARGIN_NS,
+    )
+
+
+def _unscaled(item: ControlItem, raw: bool) -> ControlItem:
+    return msgspec.structs.replace(item, scale=1.0, offset=0.0) if raw else item
+
+
+def _sync_writes(
+    session: Session, servos: Sequence[Addressed], items: Sequence[str], raw: bool
+) -> tuple[SyncWrite, ...]:
+    """Return the sync writes of these items: one for each block of adjacent items, and for each layout."""
+    groups: dict[tuple[GoalLayout, tuple[str, ...]], list[int]] = {}
+    for row, servo in enumerate(servos):
+        for block in _blocks([_writable(servo, name) for name in items]):
+            length = block[-1].address + block[-1].size - block[0].address
+            layout = GoalLayout(block[0].address, length)
+            groups.setdefault((layout, tuple(item.name for item in block)), []).append(row)
+    return tuple(
+        SyncWrite(
+            layout,
+            items.index(names[0]),
+            tuple(part),
+            tuple(part),
+            tuple(servos[row].servo_id for row in part),
+            tuple(
+                [_cell(servos[row].table.items[name], layout, items.index(name), raw) for name in names]
+                for row in part
+            ),
+            always=True,
+        )
+        for (layout, names), rows in groups.items()
+        for part in goal_parts(session.line.dialect, layout, rows)
+    )
+
+
+def _writable(servo: Addressed, name: str) -> ControlItem:
+    item = item_of(servo.table, name)
+    if item.access == "R":
+        raise ValueError(f"{item.title} of {servo.table.model} is read-only")
+    if item.area == "EEPROM":
+        raise ValueError(
+            f"{item.title} of {servo.table.model} is in the EEPROM, which wears out; use `servos.write`"
+        )
+    return item
+
+
+def _blocks(items: Sequence[ControlItem]) -> list[list[ControlItem]]:
+    """Return the items in blocks of adjacent addresses."""
+    ordered = sorted(items, key=lambda item: item.address)
+    blocks = [ordered[:1]]
+    for before, item in pairwise(ordered):
+        if before.address + before.size == item.address:
+            blocks[-1].append(item)
+        else:
+            blocks.append([item])
+    return blocks
+
+
+def _cell(item: ControlItem, layout: GoalLayout, row: int, raw: bool) -> GoalCell:
+    lowest, highest = tick_range(item)
+    known = _unscaled(item, raw)
+    place = field(item, layout.address)
+    return GoalCell(
+        place,
+        row,
+        False,
+        1.0,
+        -known.offset,
+        known.scale,
+        max(lowest, -_HIGHEST_TICK),
+        min(highest, _HIGHEST_TICK),
+    )

@@ -1,0 +1,131 @@
+"""Group: the servos of a script, with the programs that work on all of them one after the other."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+
+from dxlwire.bus.item_values import item_of, ticks_of, value_in
+from dxlwire.bus.programs import (
+    Addressed,
+    Failures,
+    ServoFailed,
+    identify,
+    read_item,
+    switch_torque,
+    write_item,
+)
+from dxlwire.bus.session import Session
+from dxlwire.control_table import ControlItem, find_table
+from dxlwire.exceptions import ServoError
+from dxlwire.exchange.arrays import Floats
+from dxlwire.transaction import Program
+
+Value = float | str
+Values = Value | Sequence[Value] | Floats
+
+
+class ServoGroup:
+    """Servos of one line, in the order in which they were given."""
+
+    def __init__(self, session: Session, servos: Sequence[Addressed]) -> None:
+        self.session = session
+        self.servos = tuple(servos)
+
+    @property
+    def ids(self) -> tuple[int, ...]:
+        """IDs of the servos."""
+        return tuple(servo.servo_id for servo in self.servos)
+
+    @property
+    def models(self) -> tuple[str, ...]:
+        """Models of the servos."""
+        return tuple(servo.table.model for servo in self.servos)
+
+    def part(self, ids: Sequence[int]) -> ServoGroup:
+        """Return a group of some of these servos, in the order of `ids`.
+
+        Raises:
+            LookupError: The group has no servo with one of these IDs.
+        """
+        known = {servo.servo_id: servo for servo in self.servos}
+        if unknown := [each for each in ids if each not in known]:
+            raise LookupError(f"no servo with ID {unknown[0]} here; there are {', '.join(map(str, known))}")
+        return ServoGroup(self.session, [known[each] for each in ids])
+
+    def read_values(self, item: str, *, raw: bool) -> Program[tuple[Floats, Failures]]:
+        """Read an item of every servo; return the values, NaN for each failure."""
+        items = [item_of(servo.table, item) for servo in self.servos]
+        values = np.full(len(items), np.nan)
+        failures: Failures = {}
+        for row, (servo, one) in enumerate(zip(self.servos, items, strict=True)):
+            try:
+                data = yield from read_item(self.session.line, servo.servo_id, one)
+                values[row] = value_in(one, data, raw=raw)
+            except ServoFailed as error:
+                failures[servo.servo_id] = error.failure
+        return values, failures
+
+    def write_values(self, item: str, values: Values, *, raw: bool) -> Program[Failures]:
+        """Write an item of every servo. All values are checked before the first one is sent."""
+        given = [values] * len(self.servos) if isinstance(values, (str, float, int)) else list(values)
+        if len(given) != len(self.servos):
+            raise ValueError(f"{item}: {len(given)} values for {len(self.servos)} servos")
+        wanted: list[tuple[Addressed, ControlItem, bytes]] = []
+        for servo, value in zip(self.servos, given, strict=True):
+            one = item_of(servo.table, item)
+            if one.access == "R":
+                raise ValueError(f"{one.title} of {servo.table.model} is read-only")
+            if one.name == "torque_enable":
+                raise ValueError(
+                    "use `servos.torque = True`, which first sets the goal to the present position"
+                )
+            wanted.append((servo, one, one.encode(ticks_of(servo.table, one, value, raw=raw))))
+        line = self.session.line
+        return _all((servo.servo_id, write_item(line, servo, one, data)) for servo, one, data in wanted)
+
+    def switch_all(self, on: bool) -> Program[Failures]:
+        """Switch the torque of every servo on or off."""
+        line = self.session.line
+        return _all((servo.servo_id, switch_torque(line, servo, on)) for servo in self.servos)
+
+    def raise_failures(self, failures: Failures) -> None:
+        """Raise ServoError if there are failures."""
+        if failures:
+            raise ServoError(self.session.name, failures)
+
+
+def _all(programs: Iterable[tuple[int, Program[None]]]) -> Program[Failures]:
+    """Run the programs of servos, given with their IDs, one after the other; return the failures."""
+    failures: Failures = {}
+    for servo_id, program in programs:
+        try:
+            yield from program
+        except ServoFailed as error:
+            failures[servo_id] = error.failure
+    return failures
+
+
+def found_group(session: Session, found: tuple[list[Addressed], Failures]) -> ServoGroup:
+    """Return the group of the servos that were identified. Raises ServoError if one was not."""
+    servos, failures = found
+    group = ServoGroup(session, servos)
+    group.raise_failures(failures)
+    return group
+
+
+def named_servos(session: Session, models: Mapping[int, str]) -> Program[tuple[list[Addressed], Failures]]:
+    """Return the program that identifies servos of known models.
+
+    Raises:
+        LookupError: There is no such model of this protocol.
+        ValueError: No servo is named, or an ID does not exist in the protocol.
+    """
+    if not models:
+        raise ValueError("name at least one servo")
+    for servo_id in models:
+        if not 0 <= servo_id <= session.line.dialect.HIGHEST_ID:
+            raise ValueError(f"ID {servo_id}: there are 0 to {session.line.dialect.HIGHEST_ID}")
+    protocol = session.plan.protocol
+    return identify(session.line, {each: find_table(model, protocol) for each, model in models.items()})

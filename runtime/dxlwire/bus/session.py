@@ -1,0 +1,163 @@
+"""Session: one open line of a script, with a lock, and the log of its packets."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from contextlib import AbstractContextManager, ExitStack
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Protocol
+
+from dxlwire.bus_plan import Budget, BusPlan
+from dxlwire.clock import Clock, MonotonicClock
+from dxlwire.exceptions import PortError
+from dxlwire.exchange.bus_engine import BusEngine, Lines
+from dxlwire.packets import Bytes, Desk, PacketKind, PacketLog
+from dxlwire.plan.line import LONGEST_RETURN_DELAY_NS, Line
+from dxlwire.port.latency_timer import is_simulated, latency_timer, shorten
+from dxlwire.port.ports import Ports, SerialPort, SerialPorts
+from dxlwire.port.serial_open import open_serial, rate_remark
+from dxlwire.transaction import Program, Result
+from dxlwire.wire.dialect import dialect_of
+
+LATENCY_NS = 1_000_000
+"""Assumed latency (ns) of an adapter without a known latency timer: one frame of full-speed USB."""
+STALL_NS = 100_000_000
+"""Latency (ns) that is assumed of simulated servos: their process may have to wait for a processor."""
+RECORDERS = "dxlwire_recorders"
+"""Group of entry points; each one is a `LineRecorder`. dxlrun has one that writes MCAP."""
+_NOTHING = Budget(0, 0, 0, 0, 0, 0)
+
+
+class LineRecorder(Protocol):
+    """Makes a log of packets in a new file; called with its path and the name of the line."""
+
+    def __call__(self, path: Path, line: str) -> AbstractContextManager[PacketLog]:
+        """Return a context manager that opens the log and closes it."""
+        ...
+
+
+class SessionLog(PacketLog):
+    """Log of a session: forwards packets to a recording, and collects the IDs of all replies."""
+
+    def __init__(self) -> None:
+        self.answered: set[int] = set()
+        self.recording: PacketLog | None = None
+
+    def packet(  # noqa: PLR0917  the contract of PacketSink
+        self, bus: int, kind: PacketKind, servo_id: int, first_ns: int, last_ns: int, data: Bytes
+    ) -> None:
+        """Forward a packet, and note the ID of a reply."""
+        if kind in (PacketKind.STATUS, PacketKind.LATE):
+            self.answered.add(servo_id)
+        if self.recording is not None:
+            self.recording.packet(bus, kind, servo_id, first_ns, last_ns, data)
+
+    @property
+    def desk(self) -> Desk | None:
+        """Memory in which the exchange kernel records packets; None without a recording."""
+        return None if self.recording is None else self.recording.desk
+
+    def commit_packets(self) -> object:
+        """Add the packets that the kernel recorded to the recording."""
+        return None if self.recording is None else self.recording.commit_packets()
+
+
+class Session:
+    """An open line: its timing, the engine that executes transactions, and a lock for threads."""
+
+    def __init__(self, ports: Ports, clock: Clock, plan: BusPlan, close: Callable[[], None]) -> None:
+        self.name = plan.port
+        self.lock = threading.RLock()
+        self.log = SessionLog()
+        self.plan = plan
+        self.lines = Lines([plan], ports, clock, self.log)
+        self.line = Line(plan.baud_rate, plan.latency_ns, plan.return_delay_ns, dialect_of(plan.protocol))
+        self.engine: BusEngine = self.lines.buses[0]
+        self.cycles = 0  # Readers and writers that were made
+        self._open = ExitStack()
+        self._open.callback(close)
+        self._closed = False
+
+    def check_open(self) -> None:
+        """Raise PortError if the line is closed or lost."""
+        if self._closed:
+            raise PortError(f"{self.name} is closed; use the bus inside its `with` block")
+        if self.engine.failure is not None:
+            raise self.engine.failure
+
+    def run_program(self, program: Program[Result]) -> Result:
+        """Run a program to its end and return its result.
+
+        Raises:
+            PortError: The line is closed or lost.
+        """
+        with self.lock:
+            self.check_open()
+            (result,) = self.lines.run_programs([program])
+            return self.finish_program(result)
+
+    def finish_program(self, result: Result | None) -> Result:
+        """Return the result of a program, None if it did not end.
+
+        Raises:
+            PortError: The line is closed or lost.
+        """
+        self.log.commit_packets()
+        self.check_open()
+        if result is None:
+            raise PortError(f"{self.name}: an exchange did not finish")
+        return result
+
+    def record(self, path: Path) -> None:
+        """Record all packets from now on in a new file.
+
+        Raises:
+            ValueError: A reader or writer exists, or a recording.
+            LookupError: No installed package records packets.
+        """
+        if self.cycles or self.log.recording is not None:
+            raise ValueError("call `record` once, before the first `reader` and `writer`")
+        found = next(iter(entry_points(group=RECORDERS)), None)
+        if found is None:
+            raise LookupError("no installed package records packets; `pip install dxlrun` does")
+        recorder: LineRecorder = found.load()
+        self.log.recording = self._open.enter_context(recorder(path, self.name))
+
+    def close(self) -> None:
+        """Close the recording and the line."""
+        with self.lock:
+            self._closed = True
+            self._open.close()
+
+
+def line_plan(name: str, baud_rate: int, protocol: float, latency_ns: int) -> BusPlan:
+    """Return the plan of a line on which nothing is read in each cycle."""
+    delay_ns = LONGEST_RETURN_DELAY_NS
+    return BusPlan(name, name, protocol, baud_rate, latency_ns, delay_ns, (), (), (), (), _NOTHING)
+
+
+def open_session(path: str, baud_rate: int, protocol: float) -> Session:
+    """Open a serial line for a script, exclusively.
+
+    Raises:
+        PortError: The port cannot be opened, or the adapter does not support the baud rate.
+        ValueError: There is no such protocol.
+    """
+    if protocol not in (1.0, 2.0):
+        raise ValueError(f"protocol {protocol}: there are 1.0 and 2.0")
+    serial = open_serial(path, baud_rate)
+    try:
+        if remark := rate_remark(serial, baud_rate):
+            raise PortError(remark)
+        shorten(serial.fileno(), path, LATENCY_NS)
+        timer = latency_timer(path)
+        found_ns = LATENCY_NS if timer is None else max(LATENCY_NS, timer.found_ms * 1_000_000)
+        latency_ns = STALL_NS if is_simulated(path) else found_ns
+        ports = SerialPorts([SerialPort(serial.fileno(), path)])
+        plan = line_plan(path, baud_rate, protocol, latency_ns)
+        return Session(ports, MonotonicClock(), plan, serial.close)
+    except BaseException:
+        serial.close()
+        raise

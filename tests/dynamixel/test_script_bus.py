@@ -1,0 +1,345 @@
+"""A script on simulated servos: what `Bus` sends, by the ledger, and what it refuses."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.kit.line_faults import corrupt_next, truncate_next
+
+import dxlwire
+from dxlrun.errors import InputError
+from dxlrun.log.log_reader import read_log
+from dxlsim import Ledger, SimulatedBus, VirtualPorts, bus_of_servos, serve_bus
+from dxlwire import AsyncBus, Bus, PortError, ServoError, Session, line_plan
+from dxlwire.clock import VirtualClock
+from dxlwire.packets import PacketKind
+
+XM = "XM430-W350:1-3"
+README = Path(dxlwire.__file__).with_name("README.md")
+READ, WRITE, SYNC_WRITE = 0x02, 0x03, 0x83
+
+
+class Script:
+    """A bus of a script on simulated servos and virtual time."""
+
+    def __init__(self, *servos, protocol=2.0):
+        self.clock, self.ledger = VirtualClock(0), Ledger()
+        simulated = bus_of_servos(servos, protocol=protocol, baud_rate=1_000_000)
+        self.simulated = SimulatedBus(simulated, self.ledger, 0)
+        ports = VirtualPorts(self.clock, [self.simulated])
+        self.session = Session(ports, self.clock, line_plan("line", 1_000_000, protocol, 0), lambda: None)
+        self.bus = Bus.on_session(self.session)
+
+    def sent(self):
+        """Return the instructions since the last call."""
+        found = [entry.data for entry in self.ledger.entries if entry.direction == "in"]
+        self.ledger.entries.clear()
+        return found
+
+    def let_pass(self, seconds):
+        self.clock.wait_until(self.clock.now_ns() + round(seconds * 1e9))
+        self.simulated.advance_to(self.clock.now_ns())
+
+
+def written(packets, address):
+    """Return the Protocol 2.0 writes to an address: ID and data."""
+    found = [(one[4], one[10:-2]) for one in packets if one[7] == WRITE and one[8] == address]
+    return [(servo_id, int.from_bytes(data, "little")) for servo_id, data in found]
+
+
+@pytest.fixture
+def script():
+    return Script(XM)
+
+
+def test_scan_finds_servos_of_both_protocols_with_their_models():
+    assert Script("XL430-W250:7", "XM430-W350:1-2").bus.scan().models == (
+        "XM430-W350",
+        "XM430-W350",
+        "XL430-W250",
+    )
+    old = Script("AX-12A:4", "MX-28:9", protocol=1.0)
+    assert old.bus.scan(range(12)).ids == (4, 9)
+    assert repr(old.bus.scan([4, 5])) == "ServoSet({4: 'AX-12A'})"
+    assert len(Script(XM).bus.scan([77])) == 0
+
+
+def test_servos_that_are_absent_or_of_another_model_are_refused(script):
+    with pytest.raises(ServoError) as caught:
+        script.bus.servos({1: "XM430-W350", 2: "XL430-W250", 9: "XM430-W350"})
+    kinds = {servo_id: one.kind for servo_id, one in caught.value.failures.items()}
+    assert kinds == {2: "wrong_model", 9: "no_reply"}
+    assert str(caught.value).splitlines()[0] == "ID 2 on line is XM430-W350, not XL430-W250"
+    with pytest.raises(LookupError, match="known models"):
+        script.bus.servos({1: "SG90"})
+    with pytest.raises(ValueError, match="ID 254: there are 0 to 252"):
+        script.bus.servos({254: "XM430-W350"})
+
+
+def test_torque_goes_on_with_the_goal_at_the_present_position(script):
+    servos = script.bus.scan()
+    script.simulated.servos[0].turn_shaft(0.5, 1)
+    script.let_pass(0.1)
+    script.sent()
+    servos[[1, 3]].torque = True
+    sent = script.sent()
+    position = servos.read("present_position", raw=True)
+    assert written(sent, 116) == [(1, position[0]), (3, position[2])]
+    assert [one[8] for one in sent if one[7] == WRITE] == [116, 64, 116, 64]  # goal first, for each servo
+    assert servos.torque.tolist() == [True, False, True]
+    servos.torque = True  # which leaves those alone that have torque
+    assert written(script.sent(), 116) == [(2, position[1])]
+    script.let_pass(1.0)
+    assert servos.read("present_position", raw=True).tolist() == position.tolist()
+
+
+def test_torque_goes_on_at_rest_in_a_mode_without_a_position_goal(script):
+    servo = script.bus.servos({2: "XM430-W350"})
+    servo.write("operating_mode", "velocity")
+    servo.write("goal_velocity", 2.0)
+    servo.torque = True
+    assert servo.read("goal_velocity").tolist() == [0.0]
+    assert servo.torque.tolist() == [True]
+
+
+def test_eeprom_is_written_only_where_it_differs_and_without_torque(script):
+    servos = script.bus.scan()
+    script.sent()
+    servos.write("operating_mode", ["position", "velocity", "position"])
+    assert written(script.sent(), 11) == [(2, 1)]
+    servos.torque = True
+    with pytest.raises(ServoError, match="ID 1 on line has torque, so Operating Mode") as caught:
+        servos.write("operating_mode", "extended_position")
+    assert {one.kind for one in caught.value.failures.values()} == {"torque_on"}
+    assert written(script.sent(), 11) == []
+
+
+@pytest.mark.parametrize(
+    ("item", "value", "words"),
+    [
+        ("goal_position", 7.0, r"Goal Position \(116\) of XM430-W350: 7 rad is outside 0 to 6.28"),
+        ("goal_position", -0.1, "-0.1 rad is outside"),
+        ("goal_position", float("nan"), "nan rad is outside"),
+        ("goal_position", [1.0, 2.0], "2 values for 3 servos"),
+        ("operating_mode", "wheel", "'wheel' is not a value"),
+        ("led", "on", "the item takes a number"),
+        ("present_position", 1.0, r"Present Position \(132\) of XM430-W350 is read-only"),
+        ("torque_enable", 1, "use `servos.torque = True`"),
+        ("goal_positon", 1.0, "has no item 'goal_positon'; did you mean goal_position"),
+    ],
+)
+def test_wrong_values_are_refused_before_a_byte_is_sent(script, item, value, words):
+    servos = script.bus.scan()
+    script.sent()
+    with pytest.raises((ValueError, LookupError), match=words):
+        servos.write(item, value)
+    assert script.sent() == []
+
+
+def test_reads_are_repeated_and_writes_are_read_back(script):
+    servos = script.bus.scan([2])
+    script.sent()
+    truncate_next(script.simulated, 2, 0)
+    corrupt_next(script.simulated, 2)
+    assert servos.read("present_temperature") > 20
+    assert [one[7] for one in script.sent()] == [READ, READ, READ]
+    truncate_next(script.simulated, 2, 0)  # executed, and its acknowledgement lost
+    servos.write("goal_position", 3.0)
+    assert [one[7] for one in script.sent()] == [WRITE, READ]
+    script.simulated.servos[1].silence()
+    with pytest.raises(ServoError) as caught:
+        servos.write("goal_position", 3.1)
+    assert str(caught.value) == "ID 2 on line did not answer the write of Goal Position (116)"
+    assert [one[7] for one in script.sent()].count(WRITE) == 1
+
+
+def test_refusal_of_a_servo_is_told(script):
+    servos = script.bus.servos({1: "XM430-W350"})
+    servos.write("max_position_limit", 3.0)
+    with pytest.raises(
+        ServoError, match=r"ID 1 on line refused the write of Goal Position \(116\)"
+    ) as caught:
+        servos.write("goal_position", 3.5)
+    assert caught.value.failures[1].kind == "refused"
+
+
+def test_reader_and_writer_have_si_units_for_each_servo():
+    script = Script("XM430-W350:1", "XL430-W250:5", "XL320:3")
+    servos = script.bus.scan()
+    servos.torque = True
+    read, write = servos.reader("present_position", "goal_position"), servos.writer("goal_position")
+    assert (read.instructions, servos.ids) == ("fast sync read + read", (1, 3, 5))
+    before = read()
+    for _ in range(30):
+        state = read()
+        write(before.position + np.array([0.1, np.nan, -0.2]))
+        script.let_pass(0.05)
+    assert state.valid.all()
+    assert (state.age < 0.01).all()
+    assert state.position == pytest.approx(before.position + np.array([0.1, 0, -0.2]), abs=0.01)
+    assert state.goal_position[1] == before.goal_position[1]
+    assert state["present_position"] is not None
+    raw = servos.reader("present_position", raw=True)()
+    assert raw.position == pytest.approx(state.position / [0.00153398, 0.00511327, 0.00153398], abs=1)
+
+
+def test_writer_sends_each_goal_in_each_call_within_the_range_of_the_item(script):
+    servos = script.bus.scan()
+    write = servos.writer("goal_position", "profile_velocity")
+    script.sent()
+    for _ in range(5):
+        write(3.0, 1.0)
+    sent = script.sent()
+    assert sent == [sent[0]] * 5
+    assert (sent[0][7], sent[0][8], sent[0][10]) == (SYNC_WRITE, 112, 8)  # the two items are one block
+    write([9.0, -1.0, np.inf], 1.0)
+    (packet,) = script.sent()
+    assert [int.from_bytes(packet[at : at + 4], "little") for at in (17, 26, 35)] == [4095, 0, 4095]
+    with pytest.raises(TypeError, match="takes 2 values"):
+        write(1.0)
+    with pytest.raises(ValueError, match="broadcast"):
+        write([1.0, 2.0], 1.0)
+    for item, words in (
+        ("operating_mode", "in the EEPROM"),
+        ("present_load", "no item"),
+        ("moving", "read-only"),
+    ):
+        with pytest.raises((ValueError, LookupError), match=words):
+            servos.writer(item)
+
+
+def test_lost_servo_is_invalid_while_the_others_are_read(script):
+    read = script.bus.scan().reader("present_position")
+    for _ in range(4):
+        assert read().valid.all()
+    script.simulated.servos[1].silence()
+    read()
+    before = read()
+    script.let_pass(0.1)
+    state = read()
+    assert state.valid.tolist() == [True, False, True]
+    assert state.age[1] > before.age[1] + 0.1
+    script.simulated.servos[1].silence(False)
+    read()
+    assert read().valid.all()
+
+
+def test_first_reply_never_came():
+    script = Script("XM430-W350:1-2")
+    servos = script.bus.scan()
+    script.simulated.servos[0].silence()
+    state = servos.reader("present_position")()
+    assert np.isnan([state.position[0], state.age[0]]).all()
+    with pytest.raises(AttributeError, match="no item 'load'"):
+        state.load  # noqa: B018  the access is what raises
+
+
+def test_line_that_is_gone_raises_and_so_does_a_closed_bus(script):
+    with script.bus as bus:
+        servos = bus.scan()
+        read, write = servos.reader("present_position"), servos.writer("goal_position")
+        read()
+        script.simulated.unplug()
+        for call in (lambda: servos.read("led"), read, lambda: write(1.0)):
+            with pytest.raises(PortError, match="is unplugged"):
+                call()
+    with pytest.raises(PortError, match="line is closed"):
+        read()
+
+
+def test_torque_stays_unless_the_bus_is_told(script):
+    with script.bus as bus:
+        bus.scan().torque = True
+    assert all(servo.torque_on for servo in script.simulated.servos)
+    script = Script(XM)
+    with Bus.on_session(script.session, limp_at_exit=True) as bus:
+        bus.scan().torque = True
+    assert not any(servo.torque_on for servo in script.simulated.servos)
+
+
+def test_record_keeps_every_packet(script, tmp_path):
+    path = tmp_path / "script.mcap"
+    with script.bus as bus:
+        bus.record(path)
+        servos = bus.scan()
+        read, write = servos.reader("present_position"), servos.writer("goal_position")
+        for _ in range(20):
+            write(read().position)
+        with pytest.raises(ValueError, match="call `record` once"):
+            bus.record(tmp_path / "other.mcap")
+    recorded = read_log(path).packets
+    for sent, direction in ((True, "in"), (False, "out")):
+        kept = [bytes(one.data) for one in recorded if (one.kind == PacketKind.INSTRUCTION) == sent]
+        there = [entry.data for entry in script.ledger.entries if entry.direction == direction]
+        assert b"".join(kept) == b"".join(there)
+    with pytest.raises(InputError, match=r"script\.mcap"):
+        Script(XM).bus.record(path)
+
+
+def test_asyncio_does_the_same_and_calls_take_turns():
+    script = Script(XM)
+
+    async def work():
+        async with AsyncBus.on_session(script.session) as bus:
+            servos = await bus.scan()
+            await servos.write("operating_mode", "position")
+            await servos.switch_torque(True)
+            assert (await servos[[2]].torque()).tolist() == [True]
+            read, write = servos.reader("present_position"), servos.writer("goal_position")
+            states = await asyncio.gather(*(read() for _ in range(5)), servos.read("present_temperature"))
+            await write(states[0].position)
+            cancelled = asyncio.ensure_future(read())
+            for _ in range(3):
+                await asyncio.sleep(0)
+            cancelled.cancel()
+            assert (await servos.read("present_temperature")).all()
+            assert (await read()).valid.all()
+            with pytest.raises(ServoError):
+                await bus.servos({9: "XM430-W350"})
+            return states
+
+    *states, temperatures = asyncio.run(work())
+    assert all(state.valid.all() for state in states)
+    assert (temperatures > 20).all()
+
+
+def test_threads_share_a_bus_and_the_event_loop_waits_for_real_lines():
+    with serve_bus("XM430-W350:1-2") as served:
+        with Bus(served.path, served.baud_rate) as bus:
+            servos = bus.servos({1: "XM430-W350", 2: "XM430-W350"})
+            read = servos.reader("present_position")
+            valid = []
+            threads = [threading.Thread(target=lambda: valid.extend(read().valid)) for _ in range(4)]
+            for thread in threads:
+                thread.start()
+            for thread in threads:
+                thread.join()
+            assert valid == [True] * 8
+            with pytest.raises(PortError, match="is in use"):
+                Bus(served.path)
+
+        async def work():
+            async with AsyncBus(served.path, served.baud_rate) as bus:
+                servos = await bus.servos({1: "XM430-W350"})
+                return (await servos.reader("present_position")()).valid.all()
+
+        assert asyncio.run(work())
+    with pytest.raises(ValueError, match=r"protocol 3: there are 1.0 and 2.0"):
+        Bus("/dev/null", protocol=3)
+
+
+def test_examples_of_the_readme_run(capsys):
+    examples = [
+        one for one in re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL) if "Bus(" in one
+    ]
+    assert len(examples) == 2
+    with serve_bus("XM430-W350:1-2") as served:
+        for example in examples:
+            exec(example.replace("/dev/ttyUSB0", served.path), {})  # noqa: S102  the README of this repository
+        assert [servo.torque for servo in served.snapshot_servos()] == [True, True]
+    assert "[3.2" in capsys.readouterr().out
