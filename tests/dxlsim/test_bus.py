@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -9,6 +10,7 @@ from tests.kit.packets import packet1, packet2
 from tests.kit.simulated_line import Line, split_statuses
 
 from dxlsim.bus.ledger import Ledger
+from dxlsim.bus.recording import BusRecording, RecordedPackets
 from dxlsim.bus.simulated_bus import SimulatedBus
 from dxlsim.simulation_plan import WHOLE_REPLIES, AdapterConfig, BusConfig, ServoConfig
 from dxlsim.virtual_ports import VirtualPorts
@@ -48,6 +50,15 @@ def notes(bus: SimulatedBus) -> str:
 
 
 # The line
+
+
+def test_a_burst_ends_with_the_adapter_that_sends_it():
+    bus = new_bus(AdapterConfig(latency_timer_ns=MS, split="byte"))
+    bus.receive_bytes(READ_1, 0)
+    assert len(bus.drain_bytes(MS)) == 1
+    bus.unplug()
+    bus.plug_in()
+    assert (bus.next_due_ns(), bus.drain_bytes(LATER)) == (None, b"")
 
 
 @pytest.mark.parametrize(
@@ -359,3 +370,11 @@ def test_a_lost_line_is_an_error_until_it_is_opened_again_and_delays_no_other():
     two.ping(0)
     assert ports.wait_for_bytes(10**9) == [0]
     assert two.read(0) == PONG_1
+
+
+def test_after_the_end_of_a_recording_its_last_answer_comes_again():
+    asked, at_ns = np.array([True, False, True, False]), np.arange(4) * MS
+    packets = RecordedPackets(asked, at_ns, at_ns, np.arange(4), np.ones(4, np.int64), b"?a?b")
+    recording = BusRecording(packets, 1_000_000)
+    answers = [recording.replay_answer(b"?") for _ in range(4)]
+    assert [one.data for answer in answers for one in answer] == [b"a", b"b", b"b", b"b"]

@@ -121,6 +121,17 @@ def test_what_is_urgent_is_done_at_last_in_a_gap_too_short_and_what_is_slow_neve
         assert text.startswith(f"{name} needs up to 0.4 ms of idle time, but a cycle leaves only 0.3 ms")
 
 
+def test_what_is_urgent_waits_no_longer_for_a_slow_program_of_its_servo(rounds):
+    ended = []
+    for name, urgency, addresses in (("slow", Urgency.SLOW, (7, 11)), ("urgent", Urgency.REPAIR, (7,))):
+        program = reading(rounds, 11, *addresses)
+        rounds.add(program, lambda _, name=name: ended.append(name), urgency, name, 0)
+        rounds.gap(READ_NS + 150_000 * (name == "slow"))
+    for _ in range(2 * STARVED + STARVED_AGAIN):
+        rounds.gap(READ_NS)
+    assert ended == ["slow", "urgent"]
+
+
 def test_every_program_of_a_line_that_is_gone_ends_with_time_outs(rounds):
     found = []
     rounds.add(reading(rounds, 11, 7, 11), found.append, Urgency.MODE, "begun")

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from tests.kit.rigs import make_plan, make_rig
+from tests.kit.rigs import make_plan, make_rig, make_x
 
 from dxlrun.channels.event_records import EventCode
 from dxlwire.exchange.samples import REPORT_AGAIN_NS
@@ -124,6 +124,13 @@ class TestJumps:
         robot = Robot(make_plan((1, 3), model="XM430-W350", protocol=2.0))
         before = robot.turn(0.0, 0.0)[1]
         assert robot.turn(0.0, 1.5) == ([True, False], before)
+
+    def test_a_joint_over_many_turns_jumps_only_after_a_reboot(self):
+        robot = Robot(make_x((1, 3), continuous=True, lower=-np.inf, upper=np.inf))
+        robot.turn(40.0, 40.0)
+        assert robot.turn(0.0, 40.0)[0] == [False, True]
+        robot.samples.buses[0].restart_count(0)
+        assert robot.turn(0.0, 40.0)[0] == [True, True]
 
     def test_a_row_looks_no_younger_for_a_reply_that_was_not_believed(self, robot):
         robot.turn(0.0, 0.0)

@@ -11,6 +11,7 @@ import subprocess
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import msgspec
 import pytest
@@ -29,7 +30,7 @@ from dxlrun.control.context import StopFlag
 from dxlrun.dynamixel.dynamixel_hardware import DynamixelHardware, ServoArrays
 from dxlrun.plan.robot_plan import Plan
 from dxlrun.process_table import read_stat
-from dxlrun.run import process_watch, supervisor
+from dxlrun.run import guardian, process_watch, supervisor
 from dxlrun.run.guardian import LONGEST_LOOK_NS, Ended, Guardian, GuardianMessage
 from dxlrun.run.loop_process import LineReopener, Pulse, StallReport, StopRequest
 from dxlrun.run.process_watch import (
@@ -380,6 +381,21 @@ def test_a_loop_is_done_only_when_it_reports_it_and_ends_well(watcher, phase, co
     assert made._ending(code) == ending
 
 
+def test_a_line_that_is_back_when_the_loop_died_gets_torque_off(watcher, monkeypatch):
+    made, _, _ = watcher
+    lines = Mock(descriptors=[7], done=(), remarks=())
+    lines.returned.side_effect = lambda: lines.descriptors.append(8)
+    monkeypatch.setattr(guardian, "KeptLines", lambda *_, **__: lines)
+    monkeypatch.setattr(child_processes, "message_channel", lambda _: (Mock(), Mock()))
+    monkeypatch.setattr(guardian.realtime_grants, "apply_to_guardian", lambda *_: ())
+    for name, value in (("_start_loop", Mock(pid=1)), ("_watch", "died"), ("_how", "it died")):
+        monkeypatch.setattr(made, name, Mock(return_value=value))
+    made._safe_stop = Mock(apply_final_state=Mock(return_value=()))
+    made._control = Mock()
+    made.guard_loop()
+    assert made._safe_stop.apply_final_state.call_args[0][0] == [7, 8]
+
+
 def test_the_guardian_runs_one_priority_above_the_loop(watcher):
     assert watcher[0]._job.plan.priority == 32  # the loop of `pair` has 31
 
@@ -694,6 +710,16 @@ def test_waits_for_simulated_servos_are_reported_once_a_second() -> None:
     }
     assert sum(one.times for one in waited) == 3000
     assert sum(one.waited_ns for one in waited) == 3000 * MS == report.total.waited_ns
+
+
+def test_looks_at_a_child_leave_no_descriptor_open():
+    child = child_processes.Child.__new__(child_processes.Child)
+    with subprocess.Popen(["/bin/sleep", "60"]) as child.process:
+        opened = os.listdir("/proc/self/fd")
+        assert not child.exited()
+        child.process.kill()
+        assert child.exited(60.0)
+        assert os.listdir("/proc/self/fd") == opened
 
 
 def test_lost_line_is_requested_once_per_loss(tmp_path):
