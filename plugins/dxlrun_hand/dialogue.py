@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import os
-import select
 import shutil
 import sys
-import termios
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from dxlrun import InputError
 from dxlrun.tooling.output import print_error
+from dxlrun_hand.typed_keys import TerminalKeys, WindowsKeys
 
 LOOK_S = 0.02
 """Interval of measurements while the dialogue waits for Enter, s."""
@@ -45,12 +43,13 @@ class Dialogue:
         Raises:
             InputError: Standard input or output is not a terminal.
         """
-        self._input = sys.stdin.fileno() if sys.stdin.isatty() else -1
-        if self._input < 0 or not sys.stdout.isatty():
+        if not (sys.stdin.isatty() and sys.stdout.isatty()):
             raise InputError(
                 f"`dxlrun {verb}` needs a terminal, and nothing was done; start it in a terminal"
             )
-        self._typed = b""
+        system = sys.platform
+        self._keys = WindowsKeys() if system == "win32" else TerminalKeys()
+        self._typed = ""
 
     def print_lines(self, *lines: str) -> None:
         """Print lines to the terminal."""
@@ -69,8 +68,8 @@ class Dialogue:
         return self._read_answer(f"{question}\n", look)
 
     def _read_answer(self, question: str, look: Callable[[], str] | None) -> str:
-        self._typed = b""
-        termios.tcflush(self._input, termios.TCIFLUSH)
+        self._typed = ""
+        self._keys.discard_keys()
         self._write_text(question)
         try:
             while (line := self._line(LOOK_S if look else None)) is None:
@@ -78,7 +77,7 @@ class Dialogue:
                     continue
                 text = look()[: shutil.get_terminal_size().columns - 1]
                 # The terminal has echoed an Enter that is waiting, so the cursor is on the next line.
-                if not select.select([self._input], [], [], 0)[0]:
+                if not self._keys.await_key(0.0):
                     self._write_text(f"\r\x1b[K{text}")
         except BaseException:  # The next output must begin a new line
             self._write_text("\n")
@@ -92,13 +91,10 @@ class Dialogue:
     def _line(self, timeout_s: float | None) -> str | None:
         """Return the next complete line of input, or None if there is none within the timeout, s. The end of
         the input counts as Ctrl-C."""
-        if select.select([self._input], [], [], timeout_s)[0]:
-            data = os.read(self._input, 4096)
-            if not data:
-                raise KeyboardInterrupt
-            self._typed += data
-        line, end, rest = self._typed.partition(b"\n")
+        if self._keys.await_key(timeout_s):
+            self._typed += self._keys.read_keys()
+        line, end, rest = self._typed.partition("\n")
         if not end:
             return None
         self._typed = rest
-        return line.decode(errors="replace").strip()
+        return line.strip()

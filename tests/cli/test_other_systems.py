@@ -93,6 +93,13 @@ WORK = {
 }
 """Commands that work, with words of their output."""
 REFUSED = {
+    **{
+        verb: (
+            f"{verb} {SINGLE} port:=/dev/none",
+            f"dxlrun: `dxlrun {verb}` needs a terminal, and nothing was done",
+        )
+        for verb in ("setup", "calibrate")
+    },
     "wrong": ("TORSO no_such:=1 --duration 1", "no_such"),  # the file is checked first
     "real": (
         f"{ROOT}/robots/single_joint.yaml port:=/dev/none --duration 1",

@@ -2,11 +2,14 @@
 
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
 from dynamixel_sdk import COMM_SUCCESS, Protocol2PacketHandler
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
+from tests.kit.line_faults import delay_next
 from tests.kit.rigs import VirtualLine
 
 from dxlrun.dynamixel.tools.one_servo import OneServo
@@ -16,6 +19,7 @@ from dxlrun.dynamixel.tools.tool_line import ToolLine
 from dxlrun.dynamixel.tools.tool_port import TunablePort
 from dxlrun.errors import PortError
 from dxlsim.simulation_plan import BusConfig, ServoConfig
+from dxlwire.control_table import find_table
 from dxlwire.wire import protocol2
 
 LOADED = "import sys; import {}; print(sorted({{'serial', 'dynamixel_sdk'}} & set(sys.modules)))"
@@ -70,6 +74,27 @@ def test_register_whose_bytes_are_a_header_is_written_and_read():
     assert line.bus.servo(1).registers["homing_offset"] == -131_073 & 0xFFFF_FFFF
 
 
+def test_late_reply_counts_neither_for_another_register_nor_after_a_write():
+    line = VirtualLine(ServoConfig(1, "XM430-W350", 2.0), rate=1_000_000)
+    (tool := ToolLine(line)).speak(2.0, 1_000_000)
+    items = find_table("XM430-W350").items
+    led, limit = (tool.line.read_range(1, items[name].address, 1) for name in ("led", "temperature_limit"))
+    turn_on, wrong = (tool.line.write_range(1, items["led"].address, bytes((value,))) for value in (1, 7))
+    lost, on, hot = ("TIMEOUT", b""), ("OK", b"\1"), ("OK", b"\x50")
+
+    def answered(*requests, delays_ms):
+        for delay_ms in delays_ms:
+            delay_next(line.bus, 1, round(delay_ms * 1e6))
+        first = replace(requests[0], timeout_ns=60_000_000)
+        replies = [tool.heard.exchange(request) for request in (first, *requests[1:])]
+        return [(reply.outcome.name, bytes(reply.parameters)) for reply in replies]
+
+    # A request that may not wait, a read after a write, and a late refusal, which fits every length.
+    assert answered(led, replace(limit, patience_ns=0), delays_ms=(60.5, 5)) == [lost, hot]
+    assert answered(led, turn_on, led, delays_ms=(61.5, 0, 5)) == [lost, ("OK", b""), on]
+    assert answered(wrong, limit, delays_ms=(60.5, 5)) == [lost, hot]
+
+
 @pytest.mark.parametrize(
     "module", ["dxlrun.run.loop_process", "dxlrun.run.guardian", "dxlrun.cli.tools.servo"]
 )
@@ -98,8 +123,10 @@ def test_port_that_pyserial_opens_finds_servos(simulated_line, macos):
     assert {entry.data[7] for entry in finish() if entry.direction == "in"} == {1, 2}
 
 
-def test_pyserial_names_what_is_wrong_with_a_port(simulated_line, macos):
-    with pytest.raises(PortError, match="port /dev/none not found"):
+def test_pyserial_names_what_is_wrong_with_a_port(simulated_line, macos, monkeypatch):
+    ports = SimpleNamespace(comports=lambda: [SimpleNamespace(device="/dev/cu.usbserial")])
+    monkeypatch.setitem(sys.modules, "serial.tools.list_ports", ports)
+    with pytest.raises(PortError, match=r"port /dev/none not found; choose from /dev/cu\.usbserial"):
         TunablePort("/dev/none")
     path, finish = simulated_line(BusConfig("main", 57_600, (), 2.0))
     with pytest.raises(PortError, match="rs485: true}` needs Linux, and this is darwin"):

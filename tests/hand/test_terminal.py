@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import re
 import shlex
+import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from tests.kit.hands import LiveRobot, Screen, written
 from tests.kit.pages import page_text
 
 from dxlrun.description.motion import read_motion
+from dxlrun_hand.dialogue import Dialogue
 
 pytestmark = pytest.mark.long
 
@@ -117,3 +120,26 @@ def test_what_was_typed_before_a_question_does_not_answer_it(robot: Path, tmp_pa
         screen.types("\x03")
         assert screen.ended() == 130
         assert "no servo was changed" in screen.text
+
+
+def test_the_console_of_windows_is_read_key_by_key(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A key from before the question, then those of two answers, a function key among them, and Ctrl-C."""
+    keys: list[str | None] = ["x", None, "s", "o", "\b", "\xe0", "H", "\r", *[None] * 3, "\r", None, "\x03"]
+
+    def next_is_key() -> bool:
+        return keys[0] is not None or bool(keys.pop(0))
+
+    console = SimpleNamespace(kbhit=next_is_key, getwch=lambda: keys.pop(0))
+    monkeypatch.setitem(sys.modules, "msvcrt", console)
+    monkeypatch.setattr(sys, "platform", "win32")
+    monkeypatch.setattr("dxlrun_hand.dialogue.LOOK_S", 0.0)
+    monkeypatch.setattr(sys, "stdin", SimpleNamespace(isatty=lambda: True))
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    dialogue = Dialogue("setup")
+    assert dialogue.ask_question("Skip? ") == "s"
+    assert dialogue.ask_while("Move it", lambda: "12 deg") == ""
+    with pytest.raises(KeyboardInterrupt):
+        dialogue.ask_question("And now? ")
+    assert capsys.readouterr().out == "Skip? so\b \b\nMove it\n\r\x1b[K12 deg\nAnd now? \n"

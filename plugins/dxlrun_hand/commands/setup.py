@@ -105,7 +105,7 @@ def _port(task: ServoSetup, plan: BusPlan, devices: Devices, *, search: bool) ->
 
     robot, dialogue = task.description.path, task.dialogue
     if not search:
-        if plan.port == SIMULATED or os.path.exists(plan.port):
+        if plan.port == SIMULATED or os.path.exists(plan.port) or plan.port in devices():
             return plan.port
         dialogue.print_lines(f"Bus {plan.name}: port {plan.port} not found.")
     found = find_port(plan.name, dialogue, devices)

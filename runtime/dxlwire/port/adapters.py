@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -30,7 +31,14 @@ class Disturbance(msgspec.Struct, frozen=True):
 
 
 def serial_devices(root: Path = ROOT) -> tuple[str, ...]:
-    """Return the device paths of the serial ports of this machine, persistent names first."""
+    """Return the device paths of the serial ports of this machine, persistent names first; `root` is for
+    tests."""
+    system = sys.platform
+    if system != "linux":
+        # Imported here because Linux has the names in its file system.
+        from serial.tools.list_ports import comports
+
+        return tuple(sorted(port.device for port in comports()))
     folders = [("serial/by-id", "*"), *(("", pattern) for pattern in (*USB_PORTS, *ONBOARD_PORTS))]
     found = (sorted((root / "dev" / folder).glob(pattern)) for folder, pattern in folders)
     return tuple(f"/{path.relative_to(root)}" for paths in found for path in paths)

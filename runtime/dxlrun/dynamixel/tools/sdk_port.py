@@ -143,9 +143,6 @@ class SdkPort(PortHandler):  # type: ignore[misc]  # the package has no types
         if data := self._port.receive_bytes(until_ns):
             self._last_byte_ns = self._now_ns()
             self._receiver.feed_bytes(data, self._last_byte_ns)
-            # Enough bytes for the awaited reply without a whole packet: its header is a false one.
-            while self._request and self._request.awaited and self._receiver.pending >= self._request.widest:
-                self._receiver.skip_header()
 
     # Methods that the packet handlers call
 
