@@ -5,7 +5,6 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Callable
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ from tests.kit.mixed_line import MixedBus
 from tests.kit.rigs import VirtualLine
 
 from dxlrun.cli.tools.scan import scan
-from dxlrun.dynamixel.tools import tool_line
+from dxlrun.dynamixel.tools import tool_port
 from dxlrun.log.log_reader import read_log
 from dxlsim.simulation_plan import BusConfig, ServoConfig
 from dxlsim.virtual_ports import VirtualPorts
@@ -93,7 +92,7 @@ def test_both_protocols_are_found_on_one_line_with_a_warning(
     line.bus = MixedBus([ServoConfig(1, "AX-12A", 2.0), ServoConfig(2, "XL430-W250", 2.0)], line.ledger)
     line.ports, line.other_rates = VirtualPorts(line.clock, [line.bus]), {}
     line.bus.servo(2).registers.show_live({"present_position": lambda: -16})
-    monkeypatch.setattr(tool_line, "TunablePort", lambda path: nullcontext(line))
+    monkeypatch.setattr(tool_port, "TunablePort", lambda path: line)
     assert scan("/dev/ttyUSB0", baud=(1_000_000,), ids="1-8", as_json=True) == 0
     said = capsys.readouterr().out
     found = [(servo["servo_id"], servo["protocol"]) for servo in result_of(said)["servos"]]

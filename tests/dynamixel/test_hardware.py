@@ -419,3 +419,10 @@ def test_two_buses_are_read_side_by_side(right):
     for bus in (0, 1):
         assert rig.packets.sent(bus) == rig.into_bus(bus)
         assert rig.packets.received(bus) == rig.out_of_bus(bus)
+
+
+def test_the_heart_beats_while_a_lost_line_is_awaited_at_the_end():
+    rig = start_rig(make_x((11, 12)))
+    rig.buses[0].unplug()
+    rig.hardware.stop()
+    assert np.diff([*rig.beats, rig.clock.now_ns()]).max() <= 21 * MS

@@ -32,6 +32,14 @@ def names(found):
     return [(one.protocol, one.baud_rate, one.servo_id, one.model) for one in found.servos]
 
 
+def test_a_rate_that_was_tried_is_left_again():
+    line = line_of(two(1))
+    tool = ToolLine(line)
+    assert tool.speak(2.0, 57_600)
+    assert tool.can_run_at(1_000_000)
+    assert line.bus.baud_rate == 57_600
+
+
 def test_one_broadcast_ping_finds_all_servos_of_protocol_2():
     line = line_of(two(1), two(7, "XL430-W250"), two(252, "XL-320"))
     found = scanned(line)
