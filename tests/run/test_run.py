@@ -31,7 +31,8 @@ def test_a_run_opens_one_socket_and_its_loop_one_line_and_keeps_its_memory(
     """
     tell = "import gc; print('collector', gc.isenabled(), [one['collections'] for one in gc.get_stats()])"
     open_to_all = ("/bin/sh", "-c", 'umask 0; exec "$@"', "sh")
-    run = live_runs.start_odd("--debug", update=tell, gateway=True, before=open_to_all)
+    loaded = "print('loaded for clients:', 'dxlrun_controllers.diff_drive_controller' in sys.modules)"
+    run = live_runs.start_odd("--debug", configure=loaded, update=tell, gateway=True, before=open_to_all)
     until(lambda: listening(run.process.pid).unix, "the socket", check=run.lives)
     run.wait_until_moving()
     loop = Path(f"/proc/{run.child('run.loop_process')}")
@@ -69,6 +70,7 @@ def test_a_run_opens_one_socket_and_its_loop_one_line_and_keeps_its_memory(
     assert code == 130
     assert not path.exists()
     assert run.is_limp()
+    assert "loaded for clients: True\n" in err
     said = {line for line in err.splitlines() if line.startswith("collector")}
     assert len(said) == 1, "it collected garbage"
     assert "False" in said.pop()

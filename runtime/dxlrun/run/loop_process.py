@@ -25,7 +25,7 @@ from dxlrun.channels import child_processes
 from dxlrun.channels.child_processes import LineLost, LineReturned, MessageChannel
 from dxlrun.channels.commands import CommandRing
 from dxlrun.channels.event_records import EventRing, EventSink, EventTotals, SimulationStall
-from dxlrun.channels.heartbeat import Heartbeat, Phase
+from dxlrun.channels.heartbeat import GatewayAvailability, Heartbeat, Phase
 from dxlrun.channels.kept import KeptStates
 from dxlrun.channels.logged_packets import PacketBatch
 from dxlrun.channels.mailbox import Mailbox
@@ -262,7 +262,9 @@ def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: Sinks, stalls: S
     pacing = Pacing(clock, plan.loop.scheduler.polling_ns)
     watch = LoopWatch(heartbeat, job.supervisor, job.guardian, plan.loop.period_ns, clock.now_ns())
     plugins = load_plugins(_looked_at(heartbeat), plan.included)
-    plugins.import_all()
+    # Only a client can load a controller while the loop runs.
+    if heartbeat.steering is not GatewayAvailability.IMPOSSIBLE:
+        plugins.import_all()
     host = LoopHost(
         ports=ports,
         clock=clock,

@@ -222,6 +222,7 @@ class _Run:
         self.job = guardian_job(
             self.plan, ports, self.memory, take_over=self.options.take_over, epoch_offset_ns=self.offset_ns
         )
+        Heartbeat(self.memory.heartbeat).set_steering(self.steering)
         self.guardian = start_guardian(self.job, others)
         started = self.guardian.ready()
         if isinstance(started, Started):
