@@ -54,7 +54,8 @@ class VirtualPort:
     def collect_bytes(self) -> bool:
         """Take the bytes that have passed the wire from the bus; return True if bytes are waiting or the
         adapter is gone."""
-        self._arrived += self._bus.drain_bytes(self._clock.now_ns())
+        if data := self._bus.drain_bytes(self._clock.now_ns()):
+            self._arrived += data
         return bool(self._arrived) or self._gone
 
     def unplug(self) -> None:

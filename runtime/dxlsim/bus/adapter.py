@@ -80,6 +80,9 @@ class SimulatedAdapter:
     def hand_over(self, now_ns: int, passing: Sequence[LineTransmission]) -> list[HandOver]:
         """Return the deliveries to the host that are due by `now_ns`, each once."""
         given: list[HandOver] = []
+        # Without a timer a transmission is delivered in the moment in which it leaves the wire.
+        if self.immediate and not self._arrived and not self._burst:
+            return given
         while (due_ns := self.next_ns(passing)) is not None and due_ns <= now_ns:
             if self._burst:
                 given.append(self._burst.popleft())

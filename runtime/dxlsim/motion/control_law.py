@@ -193,6 +193,9 @@ class ControlLaw:
             self.integral += error * self._within * self._dt_s
         torque = drive - damping * velocity
         over = np.abs(torque) > most  # Only for a motor whose current is controlled
-        self.torque = np.clip(torque, -most, most)
-        self.drive = np.where(over, self.torque, drive)
-        self.damping = np.where(over, 0.0, damping)
+        if over.any():
+            self.torque = np.maximum(np.minimum(torque, most), -most)
+            self.drive = np.where(over, self.torque, drive)
+            self.damping = np.where(over, 0.0, damping)
+        else:
+            self.torque, self.drive, self.damping = torque, drive, damping
