@@ -114,6 +114,7 @@ class LoggedPlan(msgspec.Struct):
     buses: list[LoggedBus] = []
     mechanics: MechanicsPlan = MechanicsPlan()
     groups: dict[str, tuple[str, ...]] = {}  # Joints of named groups
+    omitted: tuple[str, ...] = ()  # Joints of the robot file that the run omits
 
     def joint(self, name: str) -> JointPlan:
         """Return a joint by name; for a joint that is not in the plan, a placeholder with its name."""

@@ -61,6 +61,8 @@ def robot_line(totals: RunTotals, word: str, found: Sequence[Finding]) -> Findin
         parts.append(_reason(worst))
     parts += _goals_not_reached(totals)
     parts.append(_played(totals))
+    if totals.plan.omitted:
+        parts.append(f"without {', '.join(totals.plan.omitted)}")
     goals = totals.conduct.goals
     if goals.asked:
         parts.append(f"{goals.reached} of {counted(goals.asked, 'goal', 'goals')} reached")

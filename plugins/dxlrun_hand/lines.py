@@ -88,15 +88,20 @@ class BusLines:
 
 
 def chosen_names(
-    words: Sequence[str], known: Sequence[str], groups: Mapping[str, Sequence[str]]
+    words: Sequence[str],
+    known: Sequence[str],
+    groups: Mapping[str, Sequence[str]],
+    omitted: Sequence[str] = (),
 ) -> list[str]:
     """Return the known names that the words of a command line select, in the order of `known`.
 
     A word is a name or a group, which stands for its members. Without words, all names are returned.
 
     Raises:
-        InputError: A word is unknown.
+        InputError: A word is unknown, or one of the joints that the robot file omits.
     """
+    if absent := [word for word in words if word in omitted]:
+        raise InputError(f"the robot file has installed: false for {', '.join(absent)}; remove it first")
     wrong = [word for word in words if word not in known and word not in groups]
     if wrong:
         every = (*known, *groups)

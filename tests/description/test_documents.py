@@ -41,7 +41,7 @@ FORMS = {robot_form(), *forms(Form)}
 
 
 def test_the_examples_of_the_page_are_read() -> None:
-    robot, variant, groups, near, slide, shared, wrist, chain, motor, motion = EXAMPLES
+    robot, variant, groups, slide, shared, wrist, chain, motor, motion = EXAMPLES
     assert set(desk.robot(robot, {"port": "/dev/ttyUSB0"}).robot.joints) == {
         "head_pitch_joint",
         "head_yaw_joint",
@@ -51,9 +51,9 @@ def test_the_examples_of_the_page_are_read() -> None:
     without = robot[: robot.index("controllers:")]
     assert desk.robot(without + chain).robot.controllers["arm"].into == ("arm_pid",)
     head = robot[: robot.index("joints:")]
-    moved = {groups: "left_elbow", near: "elbow", slide: "gripper", shared: "hip", wrist: "wrist_roll"}
+    moved = {groups: "left_elbow", slide: "gripper", shared: "hip", wrist: "wrist_roll"}
     joints = [set(desk.robot(head + example).robot.joints) for example in moved]
-    assert [joint in found for joint, found in zip(moved.values(), joints, strict=True)] == [True] * 5
+    assert [joint in found for joint, found in zip(moved.values(), joints, strict=True)] == [True] * 4
     assert len(desk.motion(motion).motion.motions) == 2
     assert read_motor(desk.write(motor, "elbow.motor.yaml")).motor.p_gain == 32
 

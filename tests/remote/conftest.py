@@ -210,7 +210,12 @@ class Desk:
         plugins = plugins or PlugIns({"arm": Offer("arm", Arm, "tests 1")}, {})
         self.gateway = GatewayApp(
             self.link,
-            Preparation({joint.name: joint for joint in plan.loop.joints}, plugins, groups=plan.groups),
+            Preparation(
+                {joint.name: joint for joint in plan.loop.joints},
+                plugins,
+                groups=plan.groups,
+                omitted=plan.omitted,
+            ),
             "/logs/pair.mcap",
             now=lambda: self.now,
         )

@@ -136,4 +136,4 @@ def with_arguments(plan: RecordedPlan, loop: LoopPlan, arguments: Mapping[str, s
 
 def _compiled(plan: RecordedPlan, arguments: Mapping[str, str]) -> LoopPlan:
     files = {Path(plan.source_file).name: plan.source_text, **plan.included}
-    return compile_texts(files, arguments, plan.loop.urdf).plan.loop
+    return compile_texts(files, arguments, plan.loop.urdf, plan.omitted).plan.loop

@@ -38,6 +38,7 @@ class RecordedPlan(msgspec.Struct, frozen=True):
     source_text: str
     arguments: dict[str, str]
     included: dict[str, str] = field(default_factory=dict)
+    omitted: tuple[str, ...] = ()
 
 
 class ReplayDifference(msgspec.Struct, frozen=True):

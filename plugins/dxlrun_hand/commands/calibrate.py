@@ -124,7 +124,7 @@ def _joints(result: CompiledRobot, words: Sequence[str], dialogue: Dialogue) -> 
     from dxlrun_hand.lines import chosen_names
 
     every = {one.plan.name: one for one in result.joints}
-    names = chosen_names(words, tuple(every), result.plan.groups)
+    names = chosen_names(words, tuple(every), result.plan.groups, result.plan.omitted)
     left = {name: every[name] for name in names if every[name].drive.own}
     if others := ", ".join(name for name in names if name not in left):
         dialogue.print_lines(f"Several servos move {others}: not calibrated; measure these joints yourself.")

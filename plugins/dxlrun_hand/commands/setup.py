@@ -74,7 +74,7 @@ def set_up(
     servos = [servo.own_name for plan in task.plans for servo in plan.servos]
     # Names of joints and transmissions.
     moved = tuple(dict.fromkeys(name.partition("/")[0] for name in servos))
-    names = chosen_names(words, moved, task.description.groups)
+    names = chosen_names(words, moved, task.description.groups, task.description.omitted)
     chosen = [name for name in servos if name.partition("/")[0] in names]
     ports = {}
     with ending_with(lambda: _left(task)):

@@ -54,7 +54,7 @@ def desired_motion(path: Path, plan: Plan) -> DesiredMotion:
 
     Raises InputError unless it moves one joint by two or more positions.
     """
-    parts = len(read_motion(path, plan.groups).motion.motions)
+    parts = len(read_motion(path, plan.groups, plan.omitted).motion.motions)
     commands = plan.loop.commands
     joints = next(one.joints for one in plan.loop.controllers if one.name == commands[0].controller)
     if parts != 1 or len(joints) != 1:

@@ -101,6 +101,10 @@ class Code(StrEnum):
     )
     # joints
     UNKNOWN_JOINT = "unknown_joint", "there is no joint {joint}"
+    OMITTED = (
+        "omitted",
+        "this run omits {joint}; start it again without --without and without installed: false",
+    )
     UNKNOWN_REGISTER = "unknown_register", "{joint}: {problem}"
     INVALID_REGISTER = "invalid_register", "{joint}: {problem}"
     REGISTER_NOT_WRITTEN = "register_not_written", "{problem}"

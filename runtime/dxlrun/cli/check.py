@@ -17,6 +17,7 @@ from dxlrun.cli.inputs import (
     Motions,
     RobotPath,
     Seconds,
+    Without,
     compiled,
     read_models,
 )
@@ -39,6 +40,7 @@ def check_robot(
     /,
     *assignments: Assignment,
     play: Motions = (),
+    without: Without = (),
     duration: Seconds | None = None,
     online: Flag = False,
     graph: GraphFile = None,
@@ -72,7 +74,7 @@ def check_robot(
         _check_picture(file)
     with BusesLog(log, f"dxlrun check {robot} --online") as packets:
         ask = partial(_asked, packets) if online else None
-        result = compiled(robot, assignments, play, duration, ask)
+        result = compiled(robot, assignments, play, duration, ask, without=without)
         found = _look(result, packets) if online else None
     for file in graph or ():
         _write(result, file)

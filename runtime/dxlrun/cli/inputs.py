@@ -53,6 +53,15 @@ RobotPath = Annotated[Path, Parameter(help="Robot file.")]
 RobotName = Annotated[str | None, Parameter(help="Name of the robot, if several run.")]
 Motions = Annotated[tuple[Path, ...], Parameter(negative=(), show_default=False)]
 """Motion files; the option can be given several times."""
+Without = Annotated[
+    tuple[str, ...],
+    Parameter(
+        negative=(),
+        show_default=False,
+        help="Joint or group to omit, as if its servos were not installed. Can be given several times.",
+    ),
+]
+"""Option `--without` of commands that compile a robot file for a run."""
 AssignmentOfItsOwn = Annotated[str, Parameter(name="arg:=value")]
 Assignment = Annotated[
     AssignmentOfItsOwn, Parameter(help="Arguments of the robot file, for example port:=/dev/ttyUSB0.")
@@ -94,12 +103,13 @@ def compiled(
     play: Sequence[Path],
     duration: float | None,
     ask: Ask | None = None,
+    *,
+    without: Sequence[str] = (),
 ) -> CompiledRobot:
     """Read and compile a robot file with arguments and motion files; `duration` is that of the run, s.
 
-    `ask`: function that reads the models of joints with `model: auto` from their servos. Raises InputError
-    with
-    all mistakes of files and command line.
+    `ask`: function that reads the models of joints with `model: auto` from their servos. `without`: joints
+    and groups that are omitted. Raises InputError with all mistakes of files and command line.
     """
     known_file(robot)
     arguments = parse_assignments(assignments)
@@ -115,7 +125,7 @@ def compiled(
     # Imported here because a wrong argument needs neither numpy nor pydantic.
     from dxlrun.compile.robot_compiler import compile_files
 
-    return compile_files(robot, arguments, play, duration_ns, ask)
+    return compile_files(robot, arguments, play, duration_ns, ask, without=without)
 
 
 def read_models(

@@ -18,6 +18,7 @@ from dxlrun.cli.inputs import (
     PageFlag,
     RecordFlag,
     Seconds,
+    Without,
     compiled,
     examples_directory,
     read_models,
@@ -55,6 +56,7 @@ def run(
     *assignments: Assignment,
     duration: Seconds | None = None,
     play: Motions = (),
+    without: Without = (),
     record: RecordFlag = True,
     take_over: Flag = False,
     virtual: Flag = False,
@@ -100,7 +102,7 @@ def run(
             "a run on virtual time needs an end, or its log fills the disk; give --duration SECONDS, or "
             "--play MOTION.yaml"
         )
-    result = compiled(robot, assignments, play, duration, None if virtual else read_models)
+    result = compiled(robot, assignments, play, duration, None if virtual else read_models, without=without)
     for warning in result.warnings:
         print_warning(str(warning))
     if ledger is not None:

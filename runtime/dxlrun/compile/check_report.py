@@ -56,6 +56,7 @@ def check_report(
         "rate": rate,
         "joints": [_joint(joint, servos) for joint in joints],
         "groups": plan.groups,
+        "omitted": plan.omitted,
         **{feature.name: [*stage.rows(plan)] for feature, stage in stages(TableStage, plan.features)},
         "controllers": [_controller(controller, rate) for controller in loop.controllers],
         "buses": [_bus(bus, rate) for bus in buses],

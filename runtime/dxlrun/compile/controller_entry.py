@@ -160,6 +160,7 @@ def compile_entry(
     *,
     wrapping: Collection[str] = (),
     groups: Collection[str] = (),
+    omitted: Sequence[str] = (),
 ) -> CompiledController:
     """Validate a controller's parameters and let its class fill in joints, claims, reads and topics.
 
@@ -169,6 +170,7 @@ def compile_entry(
         joints: All joints of the robot.
         wrapping: Joints that take the shorter way round.
         groups: Names of groups, as suggestions for an unknown joint.
+        omitted: Joints of the robot file that this run omits.
 
     Raises:
         ValidationError: Its parameters are invalid.
@@ -182,9 +184,13 @@ def compile_entry(
         plan = replace(plan, parameters=json.dumps(found))
     with code.asked_to("name its interfaces"):
         interfaces = cls.interfaces(parameters, tuple(joints))
+        # With all joints of the file, a controller that reads every joint also reads those that are omitted.
+        reads = cls.interfaces(parameters, (*joints, *omitted)).reads if omitted else ()
     if breach := interfaces_breach(interfaces, chained=bool(plan.into)):
         raise code.broken(breach)
-    if mistakes := tuple(_joint_mistakes(plan.name, interfaces.joints, joints, groups)):
+    needed = {*interfaces.joints, *(name.partition("/")[0] for name in reads)}
+    mistakes = [_omitted_mistake(plan.name, joint) for joint in omitted if joint in needed]
+    if mistakes := mistakes or [*_joint_mistakes(plan.name, interfaces.joints, joints, groups)]:
         raise WrongEntry(*mistakes)
     with code.asked_to("name its topics"):
         topics = tuple(cls.topics(parameters))
@@ -238,6 +244,11 @@ def wrapped(
     except Exception:  # a plug-in's code; the caller checks the parameters as written
         return parameters
     return found
+
+
+def _omitted_mistake(name: str, joint: str) -> Mistake:
+    what = f"{name} needs joint {joint}, which is omitted"
+    return Mistake(("controllers", name, joint), what, f"remove {name}, or run with {joint}")
 
 
 def _joint_mistakes(

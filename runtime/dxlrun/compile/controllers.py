@@ -108,8 +108,9 @@ def _compiled(file: RobotFile, plan: ControllerPlan, plugins: PlugIns) -> Compil
     wrapping = {joint for joint, described in robot.joints.items() if described.wrap}
 
     def make_compiled() -> CompiledController:
-        groups = file.description.groups
-        return compile_entry(plan, offer, tuple(robot.joints), wrapping=wrapping, groups=groups)
+        groups, omitted = file.description.groups, file.description.omitted
+        joints = tuple(robot.joints)
+        return compile_entry(plan, offer, joints, wrapping=wrapping, groups=groups, omitted=omitted)
 
     found = report_entry(
         file, "controller", name, robot.controllers[name], offer.controller.Parameters, make_compiled

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -20,13 +20,16 @@ from dxlrun.plan.loop_plan import ControllerPlan, JointPlan
 _MOST_SENTENCES = 20
 
 
-def compile_texts(files: Mapping[str, str], arguments: Mapping[str, str], urdf: str | None) -> CompiledRobot:
+def compile_texts(
+    files: Mapping[str, str], arguments: Mapping[str, str], urdf: str | None, without: Sequence[str] = ()
+) -> CompiledRobot:
     """Compile a robot from the texts of its files, written into a temporary directory.
 
     Args:
         files: Texts by their paths relative to the robot file; the robot file is the first.
         arguments: Arguments of the robot file.
         urdf: Text of the URDF that the robot file names, or None.
+        without: Joints that are omitted.
 
     Raises:
         InputError: The files do not compile, or one of them is outside the directory.
@@ -39,7 +42,7 @@ def compile_texts(files: Mapping[str, str], arguments: Mapping[str, str], urdf: 
             _write(root, home / relative, text)
         try:
             with confined(root):
-                description = read_robot(home / name, arguments)
+                description = read_robot(home / name, arguments, without=without)
                 if urdf is not None and description.robot.model is not None:
                     _write(root, home / description.robot.model.urdf, urdf)
                 return compile_robot(description, [])

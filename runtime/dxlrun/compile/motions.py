@@ -79,6 +79,9 @@ def compile_motion(
     parts: list[MotionPart] = []
     if not affordable(motion, problems):
         return parts
+    if motion.without:
+        what = f"{motion.motion.name} is played without {', '.join(motion.without)}"
+        problems.warning(motion.marks.key("motions"), what, "play another motion if it needs them")
     for index, part in enumerate(motion.motion.motions):
         controller = _controller(motion, index, controllers, names, problems)
         kind, samples = playable(motion, index, controller, plans, problems)

@@ -65,6 +65,7 @@ class RobotFile(Problems):
         self.description = description
         self.robot = description.robot
         self.marks = description.marks
+        self.extend(description.remarks)
 
     def at(self, *path: str | int) -> Mark:
         """Return line and column of a value; if it is not in the file, those of its nearest parent."""

@@ -92,6 +92,7 @@ def compile_files(
     ask: Ask | None = None,
     *,
     replacements: Sequence[Replacement] = (),
+    without: Sequence[str] = (),
 ) -> CompiledRobot:
     """Read a robot file and motion files and compile them into the plan of a run.
 
@@ -102,17 +103,19 @@ def compile_files(
         duration_ns: Duration of the run; None: until the last motion ends.
         ask: Reads the models of servos on real ports with `model: auto`; called only after all checks passed.
         replacements: Values that replace those of the robot file.
+        without: Joints and groups that are omitted.
 
     Raises:
         InputError: All problems of form of all files; if there are none, all problems that the checks find.
     """
     description: Description | None = None
     groups: Groups = NO_GROUPS
+    omitted: tuple[str, ...] = ()
     read: list[MotionDescription] = []
     problems: list[Problem] = []
     try:
-        description = read_robot(robot, arguments, replacements)
-        groups = description.groups
+        description = read_robot(robot, arguments, replacements, without)
+        groups, omitted = description.groups, description.omitted
     except InputError as error:
         problems += error.problems
     for path in motions:
@@ -120,7 +123,7 @@ def compile_files(
         from dxlrun.description.motion import read_motion
 
         try:
-            read.append(read_motion(path, groups))
+            read.append(read_motion(path, groups, omitted))
         except InputError as error:
             problems += error.problems
     if description is None or problems:
@@ -243,6 +246,7 @@ def compile_robot(
         frames=frames,
         simulation=simulation,
         groups=description.groups,
+        omitted=description.omitted,
         gateway=robot.processes.gateway.enabled,
         packages=plugins.packages_of(loop.controllers, _models(buses))
         | {package: name for each in contributions for package, name in each.packages.items()}

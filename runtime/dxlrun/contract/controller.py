@@ -386,7 +386,8 @@ class Controller(ABC, Generic[P]):
     def interfaces(cls, parameters: P, joints: tuple[str, ...]) -> Interfaces:
         """Return the joints and interfaces that the controller requires and offers.
 
-        Unknown and repeated joints are refused when the robot is compiled.
+        Unknown and repeated joints are refused when the robot is compiled. Keys named `joint` or `joints`
+        and mappings by joint let a run omit a joint; a controller that still reads it is refused.
 
         Args:
             parameters: Parameters of the controller.

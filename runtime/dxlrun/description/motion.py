@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Annotated, ClassVar, Self
 
@@ -14,6 +14,7 @@ from dxlrun.description.base_form import Form, Name, key, validation_error
 from dxlrun.description.document import Marks, grow, parse, read_text, refusal
 from dxlrun.description.form_problems import read_form
 from dxlrun.description.joints.groups import NO_GROUPS, Groups, put_in
+from dxlrun.description.joints.omitted import without_joints
 from dxlrun.description.other_files import foreign_named
 from dxlrun.description.units import Acceleration, Duration, Measure, Position, Speed
 
@@ -150,25 +151,32 @@ class MotionDescription(msgspec.Struct, frozen=True):
     marks: Marks
     path: Path
     text: str  # text as read
+    without: tuple[str, ...] = ()  # joints and groups in the file that the run omits
 
 
-def read_motion(path: Path, groups: Groups = NO_GROUPS) -> MotionDescription:
-    """Read a motion file, replace its group names by joints; raise InputError with all mistakes."""
+def read_motion(path: Path, groups: Groups = NO_GROUPS, omitted: Collection[str] = ()) -> MotionDescription:
+    """Read a motion file, replace its group names by joints; raise InputError with all mistakes.
+
+    `omitted` are joints that the motion is played without.
+    """
     with foreign_named(path):
         text = read_text(path)
-    return parse_motion(text, path, groups)
+    return parse_motion(text, path, groups, omitted)
 
 
-def parse_motion(text: str, path: Path, groups: Groups = NO_GROUPS) -> MotionDescription:
+def parse_motion(
+    text: str, path: Path, groups: Groups = NO_GROUPS, omitted: Collection[str] = ()
+) -> MotionDescription:
     """Parse the text of a motion file; `path` is for messages. Raises InputError with all mistakes."""
     with foreign_named(path, text):
-        return _parsed_motion(text, path, groups)
+        return _parsed_motion(text, path, groups, omitted)
 
 
-def _parsed_motion(text: str, path: Path, groups: Groups) -> MotionDescription:
+def _parsed_motion(text: str, path: Path, groups: Groups, omitted: Collection[str]) -> MotionDescription:
     file = str(path)
     grown = put_in(grow(parse(text, file), file, refuse_arguments), groups)
     if "motions" not in grown.data and {"buses", "joints"} & grown.data.keys():
         fix = f"run it with `dxlrun {path}`, and give --play a motion file"
         raise refusal(grown.marks.value(), "this is a robot file, not a motion", fix)
-    return MotionDescription(read_form(grown, MotionForm), grown.marks, path, text)
+    grown, without = without_joints(grown, omitted)
+    return MotionDescription(read_form(grown, MotionForm), grown.marks, path, text, without)

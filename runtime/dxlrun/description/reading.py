@@ -14,6 +14,7 @@ from dxlrun.description.form_problems import path_text, read_form
 from dxlrun.description.including import KEY, Source, merged, read_sources
 from dxlrun.description.joints.groups import with_groups
 from dxlrun.description.joints.joint_forms import misfits
+from dxlrun.description.joints.omitted import omit_joints
 from dxlrun.description.mistakes.words import misplaced_sections
 from dxlrun.description.other_files import foreign_named
 from dxlrun.description.robot import Robot, robot_form
@@ -29,6 +30,10 @@ class Description(msgspec.Struct, frozen=True):
     text: str  # text as read
     arguments: dict[str, str]  # all arguments, with their values in this run
     included: Mapping[str, str] = {}  # text of each included file, by name
+    omitted: tuple[str, ...] = ()
+    """Joints that are omitted, then groups that have no other joint; `robot` is without them."""
+    remarks: tuple[Problem, ...] = ()
+    """Warnings of reading, such as what is omitted together with a joint."""
 
     @property
     def groups(self) -> dict[str, tuple[str, ...]]:
@@ -44,18 +49,29 @@ class Replacement(msgspec.Struct, frozen=True):
 
 
 def read_robot(
-    path: Path, arguments: Mapping[str, str], replacements: Sequence[Replacement] = ()
+    path: Path,
+    arguments: Mapping[str, str],
+    replacements: Sequence[Replacement] = (),
+    without: Sequence[str] = (),
 ) -> Description:
     """Read a robot file with values for its arguments (`name:=value`), and with replaced values.
+
+    Args:
+        path: The robot file.
+        arguments: Values of its arguments.
+        replacements: Values that replace those of the file.
+        without: Joints and groups that are omitted, as those with `installed: false`.
 
     Raises:
         InputError: The file or a fragment cannot be read or is not YAML; otherwise all problems of its form.
     """
     with foreign_named(path):
-        return _read_robot(path, arguments, replacements)
+        return _read_robot(path, arguments, replacements, without)
 
 
-def _read_robot(path: Path, arguments: Mapping[str, str], replacements: Sequence[Replacement]) -> Description:
+def _read_robot(
+    path: Path, arguments: Mapping[str, str], replacements: Sequence[Replacement], without: Sequence[str]
+) -> Description:
     sources = read_sources(path)
     _refuse_other_files(sources[-1])
     # Without arguments first, to learn which arguments are declared.
@@ -66,7 +82,8 @@ def _read_robot(path: Path, arguments: Mapping[str, str], replacements: Sequence
     for replacement in replacements:
         grown = _with(grown, replacement)
     _refuse_misplaced_sections(grown)
-    grown = with_groups(grown)
+    omitted = omit_joints(with_groups(grown), without)
+    grown = omitted.document
     wrong = [
         Problem(grown.marks.value(*at), what, fix) for at, what, fix in misfits(grown.data.get("joints"))
     ]
@@ -78,7 +95,9 @@ def _read_robot(path: Path, arguments: Mapping[str, str], replacements: Sequence
         joints = {str(at[1]) for at in grown.marks.keys if len(at) == 2 and at[0] == "joints"}
         raise InputError(_in_order(told_once(error.problems, joints))) from None
     included = {str(source.path): source.text for source in sources[:-1]}
-    return Description(robot, grown.marks, path, sources[-1].text, run.texts, included)
+    return Description(
+        robot, grown.marks, path, sources[-1].text, run.texts, included, omitted.names, omitted.remarks
+    )
 
 
 _OTHER_FILES = {

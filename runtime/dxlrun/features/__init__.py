@@ -28,13 +28,13 @@ FEATURES = (
 """Built-in features, in the order in which every stage calls them and in which their states are recorded."""
 
 _JOINTS = (
-    "bus continuous direction gear_ratio id joints limits model motor ratio reference servos simulation "
-    "tolerance torque travel_per_turn unit wrap "
+    "bus continuous direction gear_ratio id installed joints limits model motor ratio reference servos "
+    "simulation tolerance torque travel_per_turn unit wrap "
     "acceleration bounded effort effort_source effort_unit linear lower mode name position_source "
     "reach_lower reach_upper upper velocity velocity_source"
 )
 _SECTIONS = "arguments include joint_defaults loop model name poses processes read_before simulation"
-_REPORT = "robot rate joints groups controllers buses policies motions graph duration online"
+_REPORT = "robot rate joints groups omitted controllers buses policies motions graph duration online"
 """Keys of the report of `dxlrun check`; a feature cannot have one as its name, because its rows are added
 there under its name."""
 RESERVED: Mapping[type[Section[Any] | JointKey[Any] | ServoKey[Any] | PolicyKey[Any]], str] = {

@@ -54,6 +54,8 @@ class Plan(msgspec.Struct, frozen=True):
     """Kinematics and logging of the robot's frames; None: no URDF."""
     simulation: SimulationPlan = SimulationPlan()
     groups: dict[str, tuple[str, ...]] = {}  # Joints of named groups
+    omitted: tuple[str, ...] = ()
+    """Joints of the robot file that this run omits, then groups that have no other joint."""
     gateway: bool = True  # True if clients may connect over a Unix socket
     packages: dict[str, str] = {}
     """Distributions of the plug-in packages that run in this robot, by package: controllers, sensors, servo

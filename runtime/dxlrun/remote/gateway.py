@@ -68,10 +68,12 @@ from dxlrun.remote.named.named_joints import (
     joint_row,
     joint_servos,
     named_joints,
+    names_in,
     position_unit,
     prepared_reading,
     prepared_register,
     read_register,
+    require_installed,
     require_reboots,
     states_of,
 )
@@ -138,6 +140,7 @@ _STATUS = {
     Code.UNKNOWN_CONTROLLER: 404,
     Code.UNKNOWN_COMMAND: 404,
     Code.UNKNOWN_JOINT: 404,
+    Code.OMITTED: 404,
     Code.UNKNOWN_REGISTER: 404,
     Code.UNKNOWN_PAGE: 404,
     Code.UNKNOWN_GOAL: 404,
@@ -265,6 +268,7 @@ class GatewayApp:
             skipped=link.heartbeat.skipped,
             joints=tuple(joint.name for joint in joints),
             groups=dict(plan.groups),
+            omitted=plan.omitted,
             **vars(JointValues.from_joints(joints, effort_units(plan))),
             controllers=tuple(self._shown(one) for one in link.controllers.values()),
             sources=plan.loop.sources,
@@ -446,7 +450,8 @@ class GatewayApp:
         """
         answer: PreparedMotion | Refusal
         try:
-            motion = parse_motion(given.text, Path(file), self._link.plan.groups)
+            plan = self._link.plan
+            motion = parse_motion(given.text, Path(file), plan.groups, plan.omitted)
             # Read after parsing, which may have taken long: the motion begins where the joints are now.
             record = self._newest()
             controllers = {
@@ -491,6 +496,7 @@ class GatewayApp:
     async def command(self, asked: ClientRequest[bytes]) -> Executed[int]:
         """Check a typed command, also against joint limits; reply once the loop has executed it."""
         kind, content = asked.part("kind"), asked.body
+        require_installed(self._link.plan, names_in(content))
         query, source = asked.http.query_params, self._commanded.get(asked.part())
         if source is not None and kind == SOURCE_COMMANDS:
             name, content = source_command(
@@ -539,6 +545,7 @@ class GatewayApp:
         name = loaded.plan.name
         if kind in self._preparation.goals(loaded.plan):
             raise refused(Code.GOAL_STREAMED, {"controller": name, "kind": kind})
+        require_installed(self._link.plan, names_in(asked.body))
         prepared = self._preparation.command(loaded.plan, kind, asked.body)
         if not self._link.active(loaded):
             raise refused(Code.NOT_ACTIVE, {"controller": name})

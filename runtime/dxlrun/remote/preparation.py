@@ -196,6 +196,8 @@ class Preparation:
     """Text of the robot's URDF."""
     groups: Groups = field(default_factory=dict)
     """Names of groups of joints in the robot file, with their joints."""
+    omitted: tuple[str, ...] = ()
+    """Joints of the robot file that the run omits."""
     _known: dict[str, ResolvedController] = field(default_factory=dict, init=False)
     """Cache of `known`, by controller name; not used when a controller of that name has another plan now."""
     _schemas: dict[str, dict[str, object]] = field(default_factory=dict, init=False)
@@ -352,7 +354,14 @@ class Preparation:
             model = offer.controller.Parameters
             with bounded(plan.name):
                 wrapping = {joint.name for joint in self.joints.values() if joint.wrap}
-                found = compile_entry(plan, offer, tuple(self.joints), wrapping=wrapping, groups=self.groups)
+                found = compile_entry(
+                    plan,
+                    offer,
+                    tuple(self.joints),
+                    wrapping=wrapping,
+                    groups=self.groups,
+                    omitted=self.omitted,
+                )
                 require_fit(found, [self.joints[joint] for joint in found.plan.joints], self.urdf)
         except ValidationError as error:
             raise invalid(mistakes(error, plan.name, model)) from error

@@ -44,7 +44,8 @@ def state_directory(plan: Plan) -> Path | None:
 
     The directory is `$XDG_STATE_HOME/dxlrun/ROBOT` (XDG Base Directory Specification; ~/.local/state by
     default), and `simulated` in it for simulated servos, including those of `dxlrun sim`: states learned in a
-    simulation are not valid for real servos.
+    simulation are not valid for real servos. A run that omits joints has a directory of its own in it,
+    so that it does not replace what was learned with all joints.
     """
     named = Path(os.environ.get("XDG_STATE_HOME", ""))
     try:
@@ -52,7 +53,9 @@ def state_directory(plan: Plan) -> Path | None:
     except RuntimeError:
         return None
     robot = home / "dxlrun" / plan.robot
-    return robot / "simulated" if any(is_simulated(bus.port) for bus in plan.buses) else robot
+    if any(is_simulated(bus.port) for bus in plan.buses):
+        robot /= "simulated"
+    return robot / f"without-{_short(plan.omitted)}" if plan.omitted else robot
 
 
 def read_states(plan: Plan, directory: Path | None) -> KeptStates:

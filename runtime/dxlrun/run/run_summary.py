@@ -160,7 +160,8 @@ def run_verdict(run: RunSummary, plan: Plan) -> RunVerdict:
         after_s = max(one.t_ns - events.started_ns, 0) / 1e9
         happened.append(f"at {after_s:.1f} s {one.source} took over the robot: {last_line(one)}")
     ran_ns = (run.cycles + run.skipped) * loop.period_ns
-    happened.append(f"ran for {ran_ns / 1e9:.1f} s")
+    without = f" without {', '.join(plan.omitted)}" if plan.omitted else ""
+    happened.append(f"ran for {ran_ns / 1e9:.1f} s{without}")
     if events.goals and events.goals.asked:
         asked = counted(events.goals.asked, "goal", "goals")
         happened.append(f"{events.goals.reached} of {asked} reached")

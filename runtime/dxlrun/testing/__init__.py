@@ -49,7 +49,7 @@ def plan_of(
 ) -> Plan:
     """Compile a robot file with its arguments and motions; raises InputError with all problems."""
     description = read_robot(Path(robot), arguments or {})
-    motions = [read_motion(Path(motion), description.groups) for motion in play]
+    motions = [read_motion(Path(motion), description.groups, description.omitted) for motion in play]
     duration_ns = None if duration_s is None else round(duration_s * 1e9)
     return compile_robot(description, motions, duration_ns).plan
 

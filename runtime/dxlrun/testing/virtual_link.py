@@ -87,7 +87,7 @@ class VirtualLink:
             os.close(descriptor)
         joints = {joint.name: joint for joint in loop.joints}
         preparation = Preparation(
-            joints, load_plugins(files=plan.included), loop.sources, plan.urdf, plan.groups
+            joints, load_plugins(files=plan.included), loop.sources, plan.urdf, plan.groups, plan.omitted
         )
         log_path = str(log) if log else None
         # One second per request, so that no rate limit applies.

@@ -272,7 +272,7 @@ def _motions(info: ViewedRobot) -> Iterator[str]:
     names = {row.name for row in info.controllers}
     for path in sorted(Path(info.file).parent.glob("motions/*.yaml")):
         with suppress(DxlrunError, OSError):
-            read = read_motion(path, info.groups)
+            read = read_motion(path, info.groups, info.omitted)
             if {part.controller for part in read.motion.motions} <= names:
                 yield str(path)
 

@@ -47,6 +47,8 @@ class ViewedRobot(msgspec.Struct, frozen=True):
     """Number of periods of the loop that were skipped because a cycle overran"""
     joints: tuple[str, ...] = ()
     groups: Mapping[str, tuple[str, ...]] = {}
+    omitted: tuple[str, ...] = ()
+    """Joints of the robot file that the run omits"""
     units: Mapping[str, str] = {}
     """Units of positions by joint: rad or m"""
     effort_units: Mapping[str, str] = {}

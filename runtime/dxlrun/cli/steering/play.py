@@ -12,7 +12,7 @@ from dxlrun.cli.inputs import Flag, WaitFlag
 from dxlrun.cli.steering.goals import MOST_JOINTS, begun_or_cancelled, show_goal_progress
 from dxlrun.cli.steering.steer import ONLY_ONE, RobotChoice, connect_robot, report_done
 from dxlrun.errors import DxlrunError, InputError, Mark, Problem, Refused, suggestion
-from dxlrun.output.terminal import show_json, show_parts
+from dxlrun.output.terminal import print_warning, show_json, show_parts
 
 if TYPE_CHECKING:
     from dxlrun.description.joints.groups import Groups
@@ -81,8 +81,9 @@ def play_motions(
             _list(robot, chosen)
             return 0
         found = [_found(robot, motion) for motion in motions]
-        if len(found) > 1:
-            _check_forms(robot, [each.path for each in found if not each.player])
+        files = [each.path for each in found if not each.player]
+        if len(found) > 1 or robot.info()["omitted"]:
+            _check_forms(robot, files)
         for _ in range(loop):
             for each in found:
                 if code := _play(robot, each, speed, chosen, wait=wait):
@@ -179,12 +180,18 @@ def _has_motions(file: Path) -> bool:
 
 
 def _check_forms(robot: RemoteRobot, files: Sequence[Path]) -> None:
-    """Parse all motion files before the first is played; raises InputError with the mistakes of a file."""
+    """Parse all motion files before the first is played, and print which joints they are played without.
+
+    Raises InputError with the mistakes of a file.
+    """
     from dxlrun.description.motion import read_motion
 
-    groups = cast("Groups", robot.info()["groups"])
+    info = robot.info()
+    omitted = cast("Sequence[str]", info["omitted"])
     for file in files:
-        read_motion(file, groups)
+        motion = read_motion(file, cast("Groups", info["groups"]), omitted)
+        if motion.without:
+            print_warning(f"{robot.name}: {file} is played without {', '.join(motion.without)}")
 
 
 def _list(robot: RemoteRobot, chosen: RobotChoice) -> None:
@@ -225,7 +232,8 @@ def _playable(info: Mapping[str, object]) -> Iterator[Playable]:
             yield Playable(name, (player,), joints[player], seconds)
     for file in filter(_has_motions, _files(info)):
         try:
-            motion = read_motion(file, cast("Groups", info["groups"])).motion
+            omitted = cast("Sequence[str]", info["omitted"])
+            motion = read_motion(file, cast("Groups", info["groups"]), omitted).motion
         except InputError:
             yield Playable(file.stem, (), (), None, str(file))
             continue

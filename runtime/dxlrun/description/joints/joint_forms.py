@@ -104,6 +104,9 @@ class BareJoint(Form):
     """Form of a joint whose servos are in another section (`transmissions`); base of the other forms."""
 
     continuous: bool = key("Wheel or multi-turn joint, which needs no position limits.", "true", False)
+    installed: bool = key(
+        "Presence of the joint's servos on their bus; with false the joint is omitted.", "false", True
+    )
     torque: OnOff = key(
         "Torque at the start of a run; with off the joint is limp until `dxlrun torque on`.", "off", True
     )

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from dxlrun.channels.answers import Code, Field
@@ -71,11 +72,34 @@ def joint_row(plan: Plan, joint: str, others: Sequence[str] = ()) -> int:
 
     Raises RefusedRequest, hinting at similar joints or `others`.
     """
+    require_installed(plan, [joint])
     names = [one.name for one in plan.loop.joints]
     if joint not in names:
         hint = suggestion(joint[:_LONGEST], (*names, *others))
         raise refused(Code.UNKNOWN_JOINT, {"joint": joint[:_LONGEST], "hint": hint})
     return names.index(joint)
+
+
+def require_installed(plan: Plan, names: Iterable[str]) -> None:
+    """Raise RefusedRequest when one of the names is that of a joint or group that the run omits."""
+    if plan.omitted and (gone := {*names}.intersection(plan.omitted)):
+        raise refused(Code.OMITTED, {"joint": tuple(sorted(gone))})
+
+
+def names_in(body: bytes) -> Iterator[str]:
+    """Yield the keys of a JSON body, and the names in its lists `joints`; nothing if it is malformed."""
+    try:
+        left = [msgspec.json.decode(body)]
+    except (msgspec.MsgspecError, RecursionError):
+        # Refused later, as any other malformed command.
+        return
+    while left:
+        value = left.pop()
+        if isinstance(value, dict):
+            yield from value
+            joints = value.get("joints")
+            yield from (name for name in joints if isinstance(name, str)) if isinstance(joints, list) else ()
+            left += value.values()
 
 
 def effort_units(plan: Plan) -> dict[str, str]:
@@ -109,6 +133,7 @@ def named_joints(plan: Plan, controllers: Iterable[ControllerPlan], names: Seque
 
     Raises RefusedRequest for an unknown name, or no name.
     """
+    require_installed(plan, names)
     joints = tuple(one.name for one in plan.loop.joints)
     groups = {one.name: one.joints for one in controllers if one.command} | plan.groups | {ALL: joints}
     unknown = tuple(name[:_LONGEST] for name in names if name not in joints and name not in groups)
@@ -199,6 +224,7 @@ def _servo(plan: Plan, name: str, item: str) -> tuple[ServoPlan, ControlTable, d
 
     Raises RefusedRequest, also for a joint whose servos have different models: their control tables differ.
     """
+    require_installed(plan, [name.partition("/")[0]])
     fields: dict[str, Field] = {"joint": name[:_LONGEST], "item": item[:_LONGEST]}
     joints = plan.servos_by_joint
     known = {servo.own_name: (bus, servo) for servos in joints.values() for bus, servo in servos}

@@ -82,6 +82,8 @@ class RobotInfo(JointValues, RunInfo):
     log: str | None
     servos: dict[str, JointServo] = field(default_factory=dict)
     """First servo of each joint that servos move."""
+    omitted: tuple[str, ...] = ()
+    """Joints of the robot file that the run omits, then groups that have no other joint."""
 
 
 class Frames(msgspec.Struct, frozen=True):
