@@ -19,6 +19,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import msgspec
@@ -34,8 +35,9 @@ from dxlrun.channels.cycle import Torque
 from dxlrun.channels.event_records import EventCode
 from dxlrun.control.controllers.plugin_loading import load_plugins
 from dxlrun.plan.policy_plan import SLOW_SPEED
+from dxlrun.plan.robot_plan import Plan
 from dxlrun.remote.preparation import Preparation
-from dxlrun.testing import Log, VirtualRobot, read_log, simulated_robot
+from dxlrun.testing import Log, VirtualRobot, plan_of, read_log
 from dxlsim.bus.simulated_bus import SimulatedBus
 from dxlsim.faults.fault import parse_fault
 from dxlsim.faults.script import FaultScript
@@ -129,6 +131,23 @@ def test_every_standard_controller_is_in_the_matrix():
 
 
 @cache
+def compiled(kind: str, policy: str) -> tuple[Plan, tuple[Steered, ...]]:
+    """Return the plan of a robot with a joint for each way to command, and those ways."""
+    text, ways = robot_text(kind, policy)
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        (folder / "robot.yaml").write_text(text)
+        weights = [one.joints[0] for one in ways if one.case.type == "gravity_compensation"]
+        urdf = chain_of(weights).replace('mass value="0.1"', 'mass value="1e-9"')
+        (folder / "matrix.urdf").write_text(urdf)
+        for motor in MOTORS.glob("*.motor.yaml"):  # without a load, as the simulated joints
+            lines = motor.read_text().splitlines()
+            (folder / motor.name).write_text(
+                "\n".join(line for line in lines if not line.startswith("load:"))
+            )
+        return plan_of(folder / "robot.yaml", duration_s=8.0), ways
+
+
 def robot_text(kind: str, policy: str) -> tuple[str, tuple[Steered, ...]]:
     """Return a robot file with a joint for each way to command, and those ways."""
     # an MX-64 of Protocol 1.0 has no PWM mode, and measures no current; a differential has no joint of a PWM
@@ -194,21 +213,11 @@ def robot_text(kind: str, policy: str) -> tuple[str, tuple[Steered, ...]]:
 class Story:
     """A robot on virtual time, its clients, and a hand that turns its shafts."""
 
-    def __init__(self, folder: Path, kind: str, policy: str = "hold", seconds: float = 8.0) -> None:
+    def __init__(self, folder: Path, kind: str, policy: str = "hold") -> None:
         self.kind = kind
-        text, self.ways = robot_text(kind, policy)
-        (folder / "robot.yaml").write_text(text)
-        weights = [one.joints[0] for one in self.ways if one.case.type == "gravity_compensation"]
-        urdf = chain_of(weights).replace('mass value="0.1"', 'mass value="1e-9"')
-        (folder / "matrix.urdf").write_text(urdf)
-        for motor in MOTORS.glob("*.motor.yaml"):  # without a load, as the simulated joints
-            lines = motor.read_text().splitlines()
-            (folder / motor.name).write_text(
-                "\n".join(line for line in lines if not line.startswith("load:"))
-            )
+        plan, self.ways = compiled(kind, policy)
         self.path = folder / "run.mcap"
-        self.robot: VirtualRobot = simulated_robot(folder / "robot.yaml", duration_s=seconds, log=self.path)
-        plan = self.robot.plan
+        self.robot = VirtualRobot(plan, log=self.path)
         self.preparation = Preparation({joint.name: joint for joint in plan.loop.joints}, load_plugins())
         self.plans = {one.name: one for one in plan.loop.controllers}
         self.rows = {joint.name: row for row, joint in enumerate(plan.loop.joints)}
