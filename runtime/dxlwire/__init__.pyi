@@ -6,7 +6,7 @@ from dxlwire.bus.blocking_bus import Bus as Bus
 from dxlwire.bus.blocking_bus import ServoReader as ServoReader
 from dxlwire.bus.blocking_bus import ServoSet as ServoSet
 from dxlwire.bus.blocking_bus import ServoWriter as ServoWriter
-from dxlwire.bus.repeated_exchange import ServoStates as ServoStates
+from dxlwire.bus.servo_rows import ServoStates as ServoStates
 from dxlwire.bus.session import Session as Session
 from dxlwire.bus.session import line_plan as line_plan
 from dxlwire.bus_plan import BusPlan as BusPlan

@@ -16,7 +16,9 @@ from dxlrun.errors import InputError
 from dxlrun.log.log_reader import read_log
 from dxlsim import Ledger, SimulatedBus, VirtualPorts, bus_of_servos, serve_bus
 from dxlwire import AsyncBus, Bus, PortError, ServoError, Session, line_plan
+from dxlwire.bus import session
 from dxlwire.clock import VirtualClock
+from dxlwire.exceptions import NotCompiled
 from dxlwire.packets import PacketKind
 
 XM = "XM430-W350:1-3"
@@ -331,6 +333,46 @@ def test_threads_share_a_bus_and_the_event_loop_waits_for_real_lines():
         assert asyncio.run(work())
     with pytest.raises(ValueError, match=r"protocol 3: there are 1.0 and 2.0"):
         Bus("/dev/null", protocol=3)
+
+
+@pytest.mark.parametrize(
+    ("servos", "protocol"), [(("XM430-W350:1-2", "XL430-W250:3"), 2.0), (("AX-12A:1-3",), 1.0)]
+)
+def test_without_the_kernel_the_sdk_does_the_same(monkeypatch, servos, protocol):
+    def refuse(path=None):
+        raise NotCompiled("it was not built")
+
+    monkeypatch.setattr(session, "library", refuse)
+    with serve_bus(*servos, protocol=protocol) as served:
+        with Bus(served.path, served.baud_rate, protocol) as bus:
+            found = bus.scan(range(6))
+            assert (len(found), found[[2]].ids) == (3, (2,))
+            found.torque = True
+            read, write = found.reader("present_position", "goal_position"), found.writer("goal_position")
+            before = read()
+            write(before.position + np.array([0.1, np.nan, -100.0]))
+            state = read()
+            assert state.valid.all()
+            assert state.goal_position == pytest.approx(
+                [before.position[0] + 0.1, before.position[1], 0], abs=0.01
+            )
+            served.inject("silence servo=2")
+            state = read()
+            assert state.valid.tolist() == [True, False, True]
+            assert state.age[1] > state.age[2]
+            with pytest.raises(ServoError, match=r"ID 2 on .* did not answer"):
+                found.read("present_temperature")
+            with pytest.raises(PortError, match="is in use"):
+                Bus(served.path, served.baud_rate, protocol)
+
+        async def work():
+            async with AsyncBus(served.path, served.baud_rate, protocol) as bus:
+                one = (await bus.scan([1]))[1]
+                read, write = one.reader("present_position", raw=True), one.writer("goal_position", raw=True)
+                await write((await read()).position)
+                return await one.read("goal_position", raw=True)
+
+        assert asyncio.run(work()) > 0
 
 
 def test_examples_of_the_readme_run(capsys):

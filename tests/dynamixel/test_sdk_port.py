@@ -14,11 +14,11 @@ from tests.kit.rigs import VirtualLine
 
 from dxlrun.dynamixel.tools.one_servo import OneServo
 from dxlrun.dynamixel.tools.scanning import Search, find_servo, scan
-from dxlrun.dynamixel.tools.sdk_port import StuffedPackets
 from dxlrun.dynamixel.tools.tool_line import ToolLine
 from dxlrun.dynamixel.tools.tool_port import TunablePort
 from dxlrun.errors import PortError
 from dxlsim.simulation_plan import BusConfig, ServoConfig
+from dxlwire.bus.sdk_port import StuffedPackets
 from dxlwire.control_table import find_table
 from dxlwire.wire import protocol2
 

@@ -1,42 +1,86 @@
-"""Asyncio bus: the same servos for an asyncio program. The event loop waits for the replies, no thread."""
+"""Asyncio bus: the same servos for an asyncio program. The event loop waits for the replies."""
 
 from __future__ import annotations
 
 import asyncio
 import os
 from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dxlwire.bus.blocking_bus import RATE
+from dxlwire.bus.kernel_exchange import Reading
 from dxlwire.bus.programs import find_ids, identify
-from dxlwire.bus.repeated_exchange import Reading, ServoStates, Writing
+from dxlwire.bus.sdk_exchange import SdkReading
 from dxlwire.bus.servo_group import ServoGroup, Values, found_group, named_servos
-from dxlwire.bus.session import Session, open_session
+from dxlwire.bus.servo_rows import ServoStates, WrittenRows
+from dxlwire.bus.session import SdkSession, Session, open_session
 from dxlwire.exchange.arrays import Floats
 from dxlwire.exchange.bus_engine import NEVER
 from dxlwire.transaction import Program, ProgramJob, Result
 
 
 class _Waiting:
-    """A session whose replies are awaited by the event loop, one call at a time."""
+    """A session whose replies an asyncio program awaits, one call at a time; base class of two ways."""
 
-    def __init__(self, session: Session) -> None:
+    def __init__(self, session: Session | SdkSession) -> None:
         self.session = session
         self.lock = asyncio.Lock()
 
-    async def pump(self) -> None:
+    async def run_program(self, program: Program[Result]) -> Result:
+        """Run a program to its end and return its result. Raises PortError if the line is closed or lost."""
+        raise NotImplementedError
+
+    async def read_servos(self, reading: Reading | SdkReading) -> None:
+        """Read every item of a reader once. Raises PortError if the line is closed or lost."""
+        raise NotImplementedError
+
+
+class _InEventLoop(_Waiting):
+    """The event loop waits for the line, without a thread. The parser reads, not the kernel, because the
+    kernel would wait itself."""
+
+    session: Session
+
+    async def run_program(self, program: Program[Result]) -> Result:
+        """Run a program to its end and return its result. Raises PortError if the line is closed or lost."""
+        session = self.session
+        async with self.lock:
+            session.check_open()
+            job = ProgramJob(program)
+            session.engine.load_job(job, waits=True)
+            session.lines.discard_input(session.lines.buses)
+            await self._pump()
+            return session.finish_program(job.result)
+
+    async def read_servos(self, reading: Reading | SdkReading) -> None:
+        """Read every item of a reader once. Raises PortError if the line is closed or lost."""
+        assert isinstance(reading, Reading)  # noqa: S101  `make_reading` made it for this session
+        session = self.session
+        async with self.lock:
+            session.check_open()
+            reading.begin_cycle(kernel=False)
+            try:
+                await self._pump()
+            finally:
+                reading.end_cycle()  # Also of a cancelled call
+            session.log.commit_packets()
+            session.check_open()
+
+    async def _pump(self) -> None:
         """Execute the loaded job of the line."""
         engine, lines = self.session.engine, self.session.lines
         deadline_ns = engine.process_due(engine.now_ns())
         while deadline_ns != NEVER:  # A cancelled call leaves its job, which the next one drops
-            await self._readable(deadline_ns)
+            await self._wait_readable(deadline_ns)
             ready = lines.ports.wait_for_bytes(0)
             deadline_ns = engine.read_and_process() if ready else engine.process_due(engine.now_ns())
 
-    async def _readable(self, deadline_ns: int) -> None:
+    async def _wait_readable(self, deadline_ns: int) -> None:
         descriptors = self.session.lines.ports.descriptors
         if descriptors is None:  # Virtual time
             self.session.lines.ports.wait_for_bytes(deadline_ns)
@@ -53,16 +97,28 @@ class _Waiting:
         finally:
             loop.remove_reader(descriptors[0])
 
+
+class _InThread(_Waiting):
+    """One thread for the bus waits for the line: dynamixel-sdk does not know event loops."""
+
+    session: SdkSession
+
+    def __init__(self, session: SdkSession) -> None:
+        super().__init__(session)
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix=f"dxlwire {session.name}")
+
     async def run_program(self, program: Program[Result]) -> Result:
         """Run a program to its end and return its result. Raises PortError if the line is closed or lost."""
-        session = self.session
-        async with self.lock:
-            session.check_open()
-            job = ProgramJob(program)
-            session.engine.load_job(job, waits=True)
-            session.lines.discard_input(session.lines.buses)
-            await self.pump()
-            return session.finish_program(job.result)
+        run_program = partial(self.session.run_program, program)
+        return await asyncio.get_running_loop().run_in_executor(self._thread, run_program)
+
+    async def read_servos(self, reading: Reading | SdkReading) -> None:
+        """Read every item of a reader once. Raises PortError if the line is closed or lost."""
+        await asyncio.get_running_loop().run_in_executor(self._thread, reading.read_servos)
+
+
+def _waiting_for(session: Session | SdkSession) -> _Waiting:
+    return _InThread(session) if isinstance(session, SdkSession) else _InEventLoop(session)
 
 
 class AsyncBus:
@@ -70,13 +126,13 @@ class AsyncBus:
 
     def __init__(self, port: str, baud_rate: int = RATE, protocol: float = 2.0) -> None:
         """Open a line; the arguments and errors are those of `Bus`."""
-        self._waiting = _Waiting(open_session(port, baud_rate, protocol))
+        self._waiting = _waiting_for(open_session(port, baud_rate, protocol))
 
     @classmethod
     def on_session(cls, session: Session) -> AsyncBus:
         """Return a bus on a line that is open already, such as a simulated one on virtual time."""
         bus = cls.__new__(cls)
-        bus._waiting = _Waiting(session)
+        bus._waiting = _waiting_for(session)
         return bus
 
     async def __aenter__(self) -> AsyncBus:
@@ -152,42 +208,32 @@ class AsyncServoSet:
 
     def reader(self, *items: str, raw: bool = False) -> AsyncServoReader:
         """Prepare to read items again and again, see `ServoSet.reader`."""
-        reading = Reading(self._waiting.session, self._group.servos, items, raw=raw)
+        reading = self._group.make_reading(items, raw=raw)
         return AsyncServoReader(self._waiting, reading)
 
     def writer(self, *items: str, raw: bool = False) -> AsyncServoWriter:
         """Prepare to write items in RAM again and again, see `ServoSet.writer`."""
-        writing = Writing(self._waiting.session, self._group.servos, items, raw=raw)
+        writing = self._group.make_writing(items, raw=raw)
         return AsyncServoWriter(self._waiting, writing)
 
 
 class AsyncServoReader:
     """Reads the same items of the same servos in each call."""
 
-    def __init__(self, waiting: _Waiting, reading: Reading) -> None:
+    def __init__(self, waiting: _Waiting, reading: Reading | SdkReading) -> None:
         self._waiting = waiting
         self._reading = reading
 
     async def __call__(self) -> ServoStates:
-        """Read all items of all servos, see `ServoReader`. The event loop runs while replies are awaited, so
-        the parser reads, not the kernel."""
-        session = self._waiting.session
-        async with self._waiting.lock:
-            session.check_open()
-            self._reading.begin_cycle(kernel=False)
-            try:
-                await self._waiting.pump()
-            finally:
-                self._reading.end_cycle()  # Also of a cancelled call
-            session.log.commit_packets()
-            session.check_open()
-            return self._reading.newest_state()
+        """Read all items of all servos, see `ServoReader`."""
+        await self._waiting.read_servos(self._reading)
+        return self._reading.newest_state()
 
 
 class AsyncServoWriter:
     """Writes the same items of the same servos in each call."""
 
-    def __init__(self, waiting: _Waiting, writing: Writing) -> None:
+    def __init__(self, waiting: _Waiting, writing: WrittenRows) -> None:
         self._waiting = waiting
         self._writing = writing
 

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dxlwire.bus.programs import Addressed, Failures, find_ids, identify
-from dxlwire.bus.repeated_exchange import Reading, ServoStates, Writing
 from dxlwire.bus.servo_group import ServoGroup, Values, found_group, named_servos
-from dxlwire.bus.session import Session, open_session
+from dxlwire.bus.servo_rows import ReadRows, ServoStates, WrittenRows
+from dxlwire.bus.session import OpenLine, Session, open_session
 from dxlwire.exchange.arrays import Floats
 
 RATE = 57_600  # Factory setting of most servos, bit/s
@@ -180,7 +180,8 @@ class ServoSet:
             LookupError: A model has no such item.
         """
         with self._session.lock:
-            return ServoReader(Reading(self._session, self._group.servos, items, raw=raw))
+            reading = self._group.make_reading(items, raw=raw)
+            return ServoReader(self._session, reading)
 
     def writer(self, *items: str, raw: bool = False) -> ServoWriter:
         """Prepare to write items in RAM again and again, by sync write.
@@ -190,15 +191,16 @@ class ServoSet:
             ValueError: An item is read-only or in the EEPROM.
         """
         with self._session.lock:
-            return ServoWriter(Writing(self._session, self._group.servos, items, raw=raw))
+            writing = self._group.make_writing(items, raw=raw)
+            return ServoWriter(self._session, writing)
 
 
 class ServoReader:
     """Reads the same items of the same servos in each call."""
 
-    def __init__(self, reading: Reading) -> None:
+    def __init__(self, session: OpenLine, reading: ReadRows) -> None:
         self._reading = reading
-        self._session = reading.session
+        self._lock = session.lock
 
     def __call__(self) -> ServoStates:
         """Read all items of all servos; a lost reply makes its servo invalid and raises nothing.
@@ -206,17 +208,9 @@ class ServoReader:
         Raises:
             PortError: The line is lost.
         """
-        session, reading = self._session, self._reading
-        with session.lock:
-            session.check_open()
-            if reading.begin_cycle():
-                try:
-                    session.lines.pump()
-                finally:
-                    reading.end_cycle()  # Also after a KeyboardInterrupt
-                session.check_open()
-            session.log.commit_packets()
-            return reading.newest_state()
+        with self._lock:
+            self._reading.read_servos()
+            return self._reading.newest_state()
 
     @property
     def instructions(self) -> str:
@@ -227,9 +221,9 @@ class ServoReader:
 class ServoWriter:
     """Writes the same items of the same servos in each call."""
 
-    def __init__(self, writing: Writing) -> None:
+    def __init__(self, session: OpenLine, writing: WrittenRows) -> None:
         self._writing = writing
-        self._lock = writing.session.lock
+        self._lock = session.lock
 
     def __call__(self, *values: ArrayLike) -> None:
         """Send the values, one argument for each item: a number for all servos, or one for each. Values are

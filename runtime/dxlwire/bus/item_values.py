@@ -60,6 +60,13 @@ def ticks_of(table: ControlTable, item: ControlItem, value: float | str, *, raw:
     return round(exact)
 
 
+def nearest_ticks(item: ControlItem, value: float, *, raw: bool) -> int:
+    """Return the signed number of ticks that is nearest to a value, within the range of the item; NaN: 0."""
+    exact = value if raw else (value - item.offset) / item.scale
+    lowest, highest = tick_range(item)
+    return round(min(max(exact, lowest), highest)) if exact == exact else max(lowest, 0)  # noqa: PLR0124  NaN
+
+
 def value_in(item: ControlItem, data: bytes | memoryview, *, raw: bool) -> float:
     """Return the value in the bytes of an item: SI units, or with `raw` its signed number of ticks."""
     return float(item.decode(data)) if raw else item.value(data)

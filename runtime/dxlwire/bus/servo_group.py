@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 
 from dxlwire.bus.item_values import item_of, ticks_of, value_in
+from dxlwire.bus.kernel_exchange import Reading, Writing
 from dxlwire.bus.programs import (
     Addressed,
     Failures,
@@ -16,7 +17,8 @@ from dxlwire.bus.programs import (
     switch_torque,
     write_item,
 )
-from dxlwire.bus.session import Session
+from dxlwire.bus.sdk_exchange import SdkReading, SdkWriting
+from dxlwire.bus.session import SdkSession, Session
 from dxlwire.control_table import ControlItem, find_table
 from dxlwire.exceptions import ServoError
 from dxlwire.exchange.arrays import Floats
@@ -29,7 +31,7 @@ Values = Value | Sequence[Value] | Floats
 class ServoGroup:
     """Servos of one line, in the order in which they were given."""
 
-    def __init__(self, session: Session, servos: Sequence[Addressed]) -> None:
+    def __init__(self, session: Session | SdkSession, servos: Sequence[Addressed]) -> None:
         self.session = session
         self.servos = tuple(servos)
 
@@ -90,6 +92,18 @@ class ServoGroup:
         line = self.session.line
         return _all((servo.servo_id, switch_torque(line, servo, on)) for servo in self.servos)
 
+    def make_reading(self, items: Sequence[str], *, raw: bool) -> Reading | SdkReading:
+        """Return the exchange of a reader of these servos."""
+        if isinstance(self.session, SdkSession):
+            return SdkReading(self.session, self.servos, items, raw=raw)
+        return Reading(self.session, self.servos, items, raw=raw)
+
+    def make_writing(self, items: Sequence[str], *, raw: bool) -> Writing | SdkWriting:
+        """Return the exchange of a writer of these servos."""
+        if isinstance(self.session, SdkSession):
+            return SdkWriting(self.session, self.servos, items, raw=raw)
+        return Writing(self.session, self.servos, items, raw=raw)
+
     def raise_failures(self, failures: Failures) -> None:
         """Raise ServoError if there are failures."""
         if failures:
@@ -107,7 +121,7 @@ def _all(programs: Iterable[tuple[int, Program[None]]]) -> Program[Failures]:
     return failures
 
 
-def found_group(session: Session, found: tuple[list[Addressed], Failures]) -> ServoGroup:
+def found_group(session: Session | SdkSession, found: tuple[list[Addressed], Failures]) -> ServoGroup:
     """Return the group of the servos that were identified. Raises ServoError if one was not."""
     servos, failures = found
     group = ServoGroup(session, servos)
@@ -115,7 +129,9 @@ def found_group(session: Session, found: tuple[list[Addressed], Failures]) -> Se
     return group
 
 
-def named_servos(session: Session, models: Mapping[int, str]) -> Program[tuple[list[Addressed], Failures]]:
+def named_servos(
+    session: Session | SdkSession, models: Mapping[int, str]
+) -> Program[tuple[list[Addressed], Failures]]:
     """Return the program that identifies servos of known models.
 
     Raises:

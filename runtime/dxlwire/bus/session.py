@@ -1,7 +1,11 @@
-"""Session: one open line of a script, with a lock, and the log of its packets."""
+"""Session: one open line of a script, with a lock, and the log of its packets.
+
+The compiled kernel and its engine exchange the packets. On a system without them, such as Windows, the
+package `dynamixel-sdk` does, one servo after the other."""
 
 from __future__ import annotations
 
+import sys
 import threading
 from collections.abc import Callable
 from contextlib import AbstractContextManager, ExitStack
@@ -11,8 +15,9 @@ from typing import Protocol
 
 from dxlwire.bus_plan import Budget, BusPlan
 from dxlwire.clock import Clock, MonotonicClock
-from dxlwire.exceptions import PortError
+from dxlwire.exceptions import NotCompiled, PortError
 from dxlwire.exchange.bus_engine import BusEngine, Lines
+from dxlwire.exchange.kernel import library
 from dxlwire.packets import Bytes, Desk, PacketKind, PacketLog
 from dxlwire.plan.line import LONGEST_RETURN_DELAY_NS, Line
 from dxlwire.port.latency_timer import is_simulated, latency_timer, shorten
@@ -64,17 +69,15 @@ class SessionLog(PacketLog):
         return None if self.recording is None else self.recording.commit_packets()
 
 
-class Session:
-    """An open line: its timing, the engine that executes transactions, and a lock for threads."""
+class OpenLine:
+    """An open line: its timing, its log, and a lock for threads. Base class of both sessions."""
 
-    def __init__(self, ports: Ports, clock: Clock, plan: BusPlan, close: Callable[[], None]) -> None:
+    def __init__(self, plan: BusPlan, close: Callable[[], None]) -> None:
         self.name = plan.port
         self.lock = threading.RLock()
         self.log = SessionLog()
         self.plan = plan
-        self.lines = Lines([plan], ports, clock, self.log)
         self.line = Line(plan.baud_rate, plan.latency_ns, plan.return_delay_ns, dialect_of(plan.protocol))
-        self.engine: BusEngine = self.lines.buses[0]
         self.cycles = 0  # Readers and writers that were made
         self._open = ExitStack()
         self._open.callback(close)
@@ -84,8 +87,6 @@ class Session:
         """Raise PortError if the line is closed or lost."""
         if self._closed:
             raise PortError(f"{self.name} is closed; use the bus inside its `with` block")
-        if self.engine.failure is not None:
-            raise self.engine.failure
 
     def run_program(self, program: Program[Result]) -> Result:
         """Run a program to its end and return its result.
@@ -93,22 +94,7 @@ class Session:
         Raises:
             PortError: The line is closed or lost.
         """
-        with self.lock:
-            self.check_open()
-            (result,) = self.lines.run_programs([program])
-            return self.finish_program(result)
-
-    def finish_program(self, result: Result | None) -> Result:
-        """Return the result of a program, None if it did not end.
-
-        Raises:
-            PortError: The line is closed or lost.
-        """
-        self.log.commit_packets()
-        self.check_open()
-        if result is None:
-            raise PortError(f"{self.name}: an exchange did not finish")
-        return result
+        raise NotImplementedError
 
     def record(self, path: Path) -> None:
         """Record all packets from now on in a new file.
@@ -132,14 +118,85 @@ class Session:
             self._open.close()
 
 
+class Session(OpenLine):
+    """An open line on which the engine, and the kernel in readers and writers, exchange the packets."""
+
+    def __init__(self, ports: Ports, clock: Clock, plan: BusPlan, close: Callable[[], None]) -> None:
+        super().__init__(plan, close)
+        self.lines = Lines([plan], ports, clock, self.log)
+        self.engine: BusEngine = self.lines.buses[0]
+
+    def check_open(self) -> None:
+        """Raise PortError if the line is closed or lost."""
+        super().check_open()
+        if self.engine.failure is not None:
+            raise self.engine.failure
+
+    def run_program(self, program: Program[Result]) -> Result:
+        """Run a program to its end and return its result. Raises PortError if the line is closed or lost."""
+        with self.lock:
+            self.check_open()
+            (result,) = self.lines.run_programs([program])
+            return self.finish_program(result)
+
+    def finish_program(self, result: Result | None) -> Result:
+        """Return the result of a program, None if it did not end.
+
+        Raises:
+            PortError: The line is closed or lost.
+        """
+        self.log.commit_packets()
+        self.check_open()
+        if result is None:
+            raise PortError(f"{self.name}: an exchange did not finish")
+        return result
+
+
+class SdkSession(OpenLine):
+    """An open line on which `dynamixel-sdk` exchanges the packets, one transaction after the other."""
+
+    def __init__(self, path: str, baud_rate: int, protocol: float) -> None:
+        # Imported here because it is not needed where the kernel is compiled.
+        from dxlwire.bus.adjustable_port import AdjustablePort
+        from dxlwire.bus.sdk_port import SdkPort
+
+        port = AdjustablePort(path, baud_rate, boot_ns=0)
+        latency_ns = STALL_NS if is_simulated(path) else port.most_latency_ns
+        super().__init__(line_plan(path, baud_rate, protocol, latency_ns), port.close)
+        self.clock = port.clock
+        self._exchange = SdkPort(port, protocol, baud_rate, self.log).exchange
+
+    def run_program(self, program: Program[Result]) -> Result:
+        """Run a program to its end and return its result. Raises PortError if the line is closed or lost."""
+        with self.lock:
+            self.check_open()
+            try:
+                request = next(program)
+                while True:
+                    request = program.send(self._exchange(request))
+            except StopIteration as end:
+                result: Result = end.value
+                return result
+            finally:
+                self.log.commit_packets()
+
+
 def line_plan(name: str, baud_rate: int, protocol: float, latency_ns: int) -> BusPlan:
     """Return the plan of a line on which nothing is read in each cycle."""
     delay_ns = LONGEST_RETURN_DELAY_NS
     return BusPlan(name, name, protocol, baud_rate, latency_ns, delay_ns, (), (), (), (), _NOTHING)
 
 
-def open_session(path: str, baud_rate: int, protocol: float) -> Session:
-    """Open a serial line for a script, exclusively.
+def _is_compiled() -> bool:
+    try:
+        library()
+    except NotCompiled:
+        return False
+    return True
+
+
+def open_session(path: str, baud_rate: int, protocol: float) -> Session | SdkSession:
+    """Open a serial line for a script, exclusively: by the kernel if it is compiled, else by the SDK.
 
     Raises:
         PortError: The port cannot be opened, or the adapter does not support the baud rate.
@@ -147,6 +204,8 @@ def open_session(path: str, baud_rate: int, protocol: float) -> Session:
     """
     if protocol not in (1.0, 2.0):
         raise ValueError(f"protocol {protocol}: there are 1.0 and 2.0")
+    if sys.platform != "linux" or not _is_compiled():
+        return SdkSession(path, baud_rate, protocol)
     serial = open_serial(path, baud_rate)
     try:
         if remark := rate_remark(serial, baud_rate):

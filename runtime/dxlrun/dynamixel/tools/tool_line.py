@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dxlrun.dynamixel.tools.sdk_port import SdkPort
-from dxlrun.dynamixel.tools.tool_port import FIRST_RATE, TunablePort
+from dxlrun.dynamixel.tools.tool_port import TunablePort
 from dxlrun.errors import PortError, help_link
+from dxlwire.bus.adjustable_port import FIRST_RATE
+from dxlwire.bus.sdk_port import SdkPort
 from dxlwire.packets import Bytes, PacketKind, PacketSink
 from dxlwire.plan.line import LONGEST_RETURN_DELAY_NS, Line, listen_transaction
 from dxlwire.transaction import Program, Reply, Result

@@ -1,4 +1,4 @@
-"""Repeated exchange: a reader and a writer, which exchange the same items of the same servos again and again.
+"""Kernel exchange: a reader and a writer, which exchange the same items of the same servos again and again.
 
 Both use the exchange of the runtime. To the compiled kernel the servos of a reader are devices: units with
 any number of items, without joint or mode. A writer is one sync write for each block of adjacent items."""
@@ -6,14 +6,14 @@ any number of items, without joint or mode. A writer is one sync write for each 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
 
 import msgspec
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from dxlwire.bus.item_values import item_of, tick_range
 from dxlwire.bus.programs import Addressed
+from dxlwire.bus.servo_rows import ReadRows, ServoRows, WrittenRows, blocks_of, writable_item
 from dxlwire.bus.session import Session
 from dxlwire.bus_plan import BusPlan, DevicePlan, GoalLayout, members_of
 from dxlwire.control_table import ControlItem
@@ -34,49 +34,6 @@ from dxlwire.plan.reads import choose_reads, read_budget, read_by
 _HIGHEST_TICK = (1 << 31) - 1  # Ticks of the kernel have 32 bits
 
 
-class ServoStates:
-    """Values of one read, with one element for each servo in the order of `ids`.
-
-    An item is an attribute under its name, with or without `present_`: `state.position`,
-    `state.goal_position`. A servo that did not answer keeps its last values, NaN before the first."""
-
-    __slots__ = ("_age_ns", "_items", "_values", "ids", "valid")
-
-    def __init__(
-        self,
-        items: dict[str, int],
-        ids: tuple[int, ...],
-        values: Floats,
-        valid: NDArray[np.bool_],
-        age_ns: NDArray[np.int64],
-    ) -> None:
-        self._items = items
-        self._values = values
-        self._age_ns = age_ns
-        self.ids = ids
-        self.valid = valid  # True for each servo that answered
-
-    @property
-    def age(self) -> Floats:
-        """Age of the values, seconds; NaN before the first reply."""
-        return np.where(self._age_ns < 0, np.nan, self._age_ns * 1e-9)
-
-    def __getattr__(self, name: str) -> Floats:
-        try:
-            values: Floats = self._values[self._items[name]]
-        except KeyError:
-            raise AttributeError(f"this reader has no item {name!r}") from None
-        return values
-
-    def __getitem__(self, item: str) -> Floats:
-        return self.__getattr__(item)
-
-    def __repr__(self) -> str:
-        return (
-            f"ServoStates({', '.join(self._items)}; {np.count_nonzero(self.valid)} of {len(self.ids)} valid)"
-        )
-
-
 class _Joints(msgspec.Struct):
     """States of joints, of which a script has none; implements `JointArrays`."""
 
@@ -86,14 +43,6 @@ class _Joints(msgspec.Struct):
     valid: NDArray[np.bool_] = msgspec.field(default_factory=lambda: np.empty(0, dtype=np.bool_))
     age_ns: NDArray[np.int64] = msgspec.field(default_factory=lambda: np.empty(0, dtype=np.int64))
     mode: NDArray[np.uint8] = msgspec.field(default_factory=lambda: np.empty(0, dtype=np.uint8))
-
-
-class _Rows(msgspec.Struct):
-    """States of the servos of a reader; implements `SourceArrays`."""
-
-    values: Floats
-    valid: NDArray[np.bool_]
-    age_ns: NDArray[np.int64]
 
 
 class _NoReports:
@@ -107,31 +56,38 @@ class _Writes(msgspec.Struct):
     sync_writes: tuple[SyncWrite, ...] = ()
 
 
-class Reading:
-    """The exchange of one reader, without its wait for replies."""
+class Reading(ReadRows):
+    """The exchange of one reader by the kernel, or by the parser after a deviation from the plan."""
 
     def __init__(
         self, session: Session, servos: Sequence[Addressed], items: Sequence[str], *, raw: bool
     ) -> None:
-        if not items:
-            raise ValueError("name at least one item")
-        session.cycles += 1
-        count = len(servos)
+        super().__init__(session, servos, items)
         self.session = session
-        self.ids = tuple(servo.servo_id for servo in servos)
-        self._items = {name: index for index, name in enumerate(items)}
-        self._items |= {name.removeprefix("present_"): index for name, index in self._items.items()}
-        self._values: Floats = np.full((len(items), count), np.nan)
-        self._arrays = _Rows(
-            self._values.reshape(-1), np.zeros(count, np.bool_), np.full(count, -1, np.int64)
-        )
         plan = _read_plan(session, servos, items, raw)
         self._samples = Samples([plan], _Joints(), self._arrays, _NoReports())
         self.reads = CyclicReads(plan, self._samples.buses[0], session.engine.owed)
         self.kernel = _kernel(session, plan, self._samples, _Writes())
         self.exchange = CyclicExchange(session.lines, [self.reads], self.kernel)
         self.by_kernel = False
-        self.read_by = plan.read_by  # Instructions of a cycle in the e-Manual's words
+        self._read_by = plan.read_by
+
+    @property
+    def read_by(self) -> str:
+        """Instructions of one call in the e-Manual's words."""
+        return self._read_by
+
+    def read_servos(self) -> None:
+        """Read every item of every servo once. Raises PortError if the line is closed or lost."""
+        session = self.session
+        session.check_open()
+        if self.begin_cycle():
+            try:
+                session.lines.pump()
+            finally:
+                self.end_cycle()  # Also after a KeyboardInterrupt
+            session.check_open()
+        session.log.commit_packets()
 
     def begin_cycle(self, *, kernel: bool = True) -> bool:
         """Read by the kernel if it can; otherwise load the reads for `Lines.pump`, and return True."""
@@ -161,43 +117,23 @@ class Reading:
         reads.given_up.clear()
         self._samples.fill_states(self.session.lines.clock.now_ns())
 
-    def newest_state(self) -> ServoStates:
-        """Return the values of the newest cycle."""
-        arrays = self._arrays
-        return ServoStates(
-            self._items, self.ids, self._values.copy(), arrays.valid.copy(), arrays.age_ns.copy()
-        )
 
-
-class Writing:
-    """The sync writes of one writer."""
+class Writing(WrittenRows):
+    """The sync writes of one writer, built by the kernel."""
 
     def __init__(
         self, session: Session, servos: Sequence[Addressed], items: Sequence[str], *, raw: bool
     ) -> None:
-        if not 1 <= len(items) <= len(COMMAND_INTERFACES):
-            raise ValueError(f"name one to {len(COMMAND_INTERFACES)} items; {len(items)} were given")
-        session.cycles += 1
-        self.session = session
-        count = len(servos)
-        self._goals: Floats = np.full((len(COMMAND_INTERFACES), count), np.nan)
-        self._count = len(items)
-        samples = Samples([session.plan], _Joints(), _Rows(np.empty(0), *_empty()), _NoReports())
+        super().__init__(session, servos, items)
+        self._session = session
+        samples = Samples([session.plan], _Joints(), ServoRows(np.empty(0), *_empty()), _NoReports())
         self._writes = _Writes(_sync_writes(session, servos, items, raw))
         self._kernel = _kernel(session, session.plan, samples, self._writes, self._goals)
         self._kernel.plan_writes()
 
-    def send_values(self, values: Sequence[ArrayLike]) -> None:
-        """Send one packet for each block of items, which no servo acknowledges.
-
-        Raises:
-            PortError: The line is lost.
-        """
-        if len(values) != self._count:
-            raise TypeError(f"this writer takes {self._count} values, one for each item; got {len(values)}")
-        for row, value in enumerate(values):
-            self._goals[row] = value
-        session = self.session
+    def send_goals(self) -> None:
+        """Send the goals. Raises PortError if the line is closed or lost."""
+        session = self._session
         session.check_open()
         if code := self._kernel.write():
             for failure in self._kernel.finish_write(code).values():
@@ -257,7 +193,7 @@ def _sync_writes(
     """Return the sync writes of these items: one for each block of adjacent items, and for each layout."""
     groups: dict[tuple[GoalLayout, tuple[str, ...]], list[int]] = {}
     for row, servo in enumerate(servos):
-        for block in _blocks([_writable(servo, name) for name in items]):
+        for block in blocks_of([writable_item(servo, name) for name in items]):
             length = block[-1].address + block[-1].size - block[0].address
             layout = GoalLayout(block[0].address, length)
             groups.setdefault((layout, tuple(item.name for item in block)), []).append(row)
@@ -277,29 +213,6 @@ def _sync_writes(
         for (layout, names), rows in groups.items()
         for part in goal_parts(session.line.dialect, layout, rows)
     )
-
-
-def _writable(servo: Addressed, name: str) -> ControlItem:
-    item = item_of(servo.table, name)
-    if item.access == "R":
-        raise ValueError(f"{item.title} of {servo.table.model} is read-only")
-    if item.area == "EEPROM":
-        raise ValueError(
-            f"{item.title} of {servo.table.model} is in the EEPROM, which wears out; use `servos.write`"
-        )
-    return item
-
-
-def _blocks(items: Sequence[ControlItem]) -> list[list[ControlItem]]:
-    """Return the items in blocks of adjacent addresses."""
-    ordered = sorted(items, key=lambda item: item.address)
-    blocks = [ordered[:1]]
-    for before, item in pairwise(ordered):
-        if before.address + before.size == item.address:
-            blocks[-1].append(item)
-        else:
-            blocks.append([item])
-    return blocks
 
 
 def _cell(item: ControlItem, layout: GoalLayout, row: int, raw: bool) -> GoalCell:

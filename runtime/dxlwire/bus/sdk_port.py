@@ -12,8 +12,8 @@ from dynamixel_sdk import COMM_RX_CORRUPT, COMM_RX_TIMEOUT, COMM_SUCCESS, PortHa
 from dynamixel_sdk import Protocol1PacketHandler as Protocol1Packets
 from dynamixel_sdk import Protocol2PacketHandler as Protocol2Packets
 
-from dxlrun.dynamixel.tools.tool_port import TunablePort
-from dxlrun.errors import PortError
+from dxlwire.bus.adjustable_port import AdjustablePort
+from dxlwire.exceptions import PortError
 from dxlwire.exchange.bus_engine import LEAST_QUIET_NS, PATIENT_DRAIN_LIMIT_NS, QUIET_BYTES
 from dxlwire.exchange.owed import OwedReplies
 from dxlwire.packets import PacketKind, PacketSink
@@ -55,7 +55,7 @@ class SdkPort(PortHandler):  # type: ignore[misc]  # the package has no types
     gives the packet handlers only the status that answers their instruction.
     """
 
-    def __init__(self, port: TunablePort, protocol: float, baud_rate: int, sink: PacketSink) -> None:
+    def __init__(self, port: AdjustablePort, protocol: float, baud_rate: int, sink: PacketSink) -> None:
         super().__init__(port.name)
         self.baudrate = baud_rate
         self.ids: set[int] = set()
