@@ -174,14 +174,29 @@ class Story:
 
     def cycles(self, count: int) -> Iterator[np.ndarray]:
         """Yield what is commanded in each cycle, shape (4, joints), and of devices."""
-        for _ in range(count):
+        chance, joints = self._chance, (count, len(self._at))
+        drawn = zip(
+            chance.random(joints) > 0.02,
+            chance.uniform(-0.7, 0.91, joints),
+            chance.normal(0, 1, joints),
+            chance.normal(11.5, 0.2, joints),
+            chance.normal(0.5, 0.1, (count, self.stage.context.reads.size)),
+            strict=True,
+        )
+        for heard, effort, warmer, voltage, reads in drawn:
             if not self.quiet:
                 self._steer()
             stage = self.stage
             stage.time_ns += self.period_ns
             stage.controller.update(stage.time_ns, self.period_ns)
             yield np.concatenate([stage.commands.values.ravel(), stage.context.device_commands])
-            self._move()
+            self._move(heard, effort)
+            states = stage.states
+            states.temperature[:] = np.rint(
+                np.where(np.isnan(states.temperature), 45.0, states.temperature) + warmer
+            )
+            states.voltage[:] = voltage
+            self._read(reads)
 
     def _steer(self) -> None:
         stage, chance, case = self.stage, self._chance, self.case
@@ -197,26 +212,21 @@ class Story:
             for row in stage.context.references.values:
                 row[:] = np.where(chance.random(row.size) < 0.7, chance.uniform(-1, 1, row.size), np.nan)
 
-    def _move(self) -> None:
-        stage, chance = self.stage, self._chance
-        states, commands = stage.states, stage.commands
-        np.copyto(stage.sent.values, commands.values, where=np.isfinite(commands.values))
-        count = len(self._at)
+    def _move(self, heard: np.ndarray, effort: np.ndarray) -> None:
+        states, commands = self.stage.states, self.stage.commands
+        np.copyto(self.stage.sent.values, commands.values, where=np.isfinite(commands.values))
         wanted = np.where(np.isfinite(commands.position), commands.position, self._at)
         before, self._at = self._at, self._at + 0.6 * (wanted - self._at)
-        heard = chance.random(count) > 0.02
         states.valid[:] = heard
         np.copyto(states.position, self._at, where=heard)
         np.copyto(states.velocity, (self._at - before) / 0.02, where=heard)
-        np.copyto(states.effort, chance.uniform(-0.7, 0.91, count), where=heard)
+        np.copyto(states.effort, effort, where=heard)
         states.age_ns[:] = np.where(heard, 1000, states.age_ns + self.period_ns)
-        states.temperature[:] = np.round(
-            np.nan_to_num(states.temperature, nan=45.0) + chance.normal(0, 1, count)
-        )
-        states.voltage[:] = 11.5 + chance.normal(0, 0.2, count)
-        reads = stage.context.reads
-        reads[:] = 0.5 + chance.normal(0, 0.1, reads.size)
-        for place, name in enumerate(stage.interfaces.reads):
+
+    def _read(self, values: np.ndarray) -> None:
+        reads, chance = self.stage.context.reads, self._chance
+        reads[:] = values
+        for place, name in enumerate(self.stage.interfaces.reads):
             if name.endswith("/age"):
                 reads[place] = chance.choice([0.001, 0.3, 1.0], p=[0.98, 0.01, 0.01])
             elif not name.endswith(("/position", "/velocity")) and chance.random() < 0.01:
