@@ -242,7 +242,7 @@ class Side:
                 devices._take_back(index, loss)
         match rng.randrange(7):
             case 0 | 1:
-                plan = self.hardware._plans[number].servos[servo]
+                plan = self.hardware._lines.plans[number].servos[servo]
                 mode = rng.choice([one.mode for one in plan.modes] + [Mode.UNKNOWN])
                 servos.goals.set_mode(servo, mode)
                 self.states.mode[row] = mode

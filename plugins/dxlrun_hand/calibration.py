@@ -30,7 +30,6 @@ _READINGS = 5
 """Number of readings of a joint at rest, whose median is its position."""
 _SHIFTING = {
     "drive_mode": (0x01, 0),
-    "homing_offset": (-1, 0),
     "multi_turn_offset": (-1, 0),
     "resolution_divider": (-1, 1),
 }
@@ -95,6 +94,8 @@ class HandJoint:
             if value & bits != only:
                 title = self.table.items[name].title
                 raise ServoFault(f"{self._label}: {title} = {value} shifts its angles; write {only}")
+        self.offset = self._one.read_offset()
+        """Homing Offset that the servo adds to its angle, ticks; the angles of this object are without it."""
         self._turn = round(math.tau / self.table.rad_per_tick)
         self._raw = self._travelled = 0
         self.limp = False
@@ -153,7 +154,7 @@ class HandJoint:
 
     def _read_raw(self) -> int:
         try:
-            return self._one.read_items(["present_position"])["present_position"]
+            return self._one.read_items(["present_position"])["present_position"] - self.offset
         except ServoFault:
             remedy = choose_remedy(self._port)
             raise ServoFault(f"{self._label} no longer answers; {remedy}") from None
@@ -170,6 +171,9 @@ def measure_joints(joints: Sequence[HandJoint], dialogue: Dialogue) -> list[Join
     dialogue.ask_question("The torque will be switched off: hold the joints, and press Enter ")
     for joint in joints:
         joint.let_go()
+        if joint.offset:
+            title = joint.table.items["homing_offset"].title
+            dialogue.print_lines(f"{joint.name}: {title} = {joint.offset} is not part of its angles.")
     names = ", ".join(joint.name for joint in joints)
     dialogue.ask_question(f"Move to the zero pose: {names}. Then press Enter ")
     zeros = [joint.start_counting() for joint in joints]

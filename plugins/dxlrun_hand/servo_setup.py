@@ -88,13 +88,25 @@ class ServoSetup:
                         self.plans = compile_robot(self.description, [], models=self._models).plan.buses
                         plan = self.plans[index]
                     self.changing = name
-                    for sentence in bring(OneServo(tool, found), plan, _named(plan, name)):
+                    one, servo = OneServo(tool, found), _named(plan, name)
+                    for sentence in (*bring(one, plan, servo), *self._clear_offset(one, servo)):
                         self.dialogue.print_lines(f"  {name}: {sentence}")
             except (PortError, ServoFault) as error:
                 self.dialogue.print_lines(*error.sentences)
                 continue
             self.changing = ""
             return True
+
+    def _clear_offset(self, one: OneServo, servo: ServoPlan) -> list[str]:
+        """Write Homing Offset 0 if the user agrees; the robot file of `servo` does not mention the offset."""
+        item = one.table.items.get("homing_offset")
+        if item is None or servo.homing_offset is not None:
+            return []
+        offset = one.read_items([item.name])[item.name]
+        what = f"{item.title} is {offset}, from another program. Runs take it into account. Write 0?"
+        if not offset or not yes(self.dialogue, what):
+            return []
+        return [*one.write_registers((one.register(item.name, 0),))]
 
     def _alone(self, tool: ToolLine, plan: BusPlan, servo: ServoPlan) -> FoundServo:
         """Search a bus for the only servo that answers, at its usual baud rates first, then at all.

@@ -3,11 +3,13 @@ reply layouts and units."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Literal
 
 import msgspec
+from msgspec.structs import replace
 
 from dxlwire.exceptions import help_link
 from dxlwire.joint_unit import ROTARY, JointUnit
@@ -102,6 +104,7 @@ class RegisterValue(msgspec.Struct, frozen=True):
     value: int  # Integer on the wire; negative numbers are written in two's complement
     name: str  # Name in the control table: `position_p_gain`
     eeprom: bool = False  # True if the value survives power-off and is writable only while torque is off
+    write: bool = True  # False: the start compares the register, and refuses another value
 
     @property
     def data(self) -> bytes:
@@ -165,7 +168,8 @@ class ServoPlan(msgspec.Struct, frozen=True):
     servo_id: int
     model: str
     model_number: int
-    reference: float  # rad, counted from the servo's raw 0
+    reference: float
+    """rad, counted from the servo's raw 0; in a plan that was placed, from tick 0 of its position."""
     direction: int
     rad_per_tick: float
     max_tick: int
@@ -200,6 +204,12 @@ class ServoPlan(msgspec.Struct, frozen=True):
     name: str = ""
     """Unique name of the servo if several servos move one joint: `hip/1`, `wrist/left`; otherwise empty."""
     unit: JointUnit = ROTARY  # Unit of the joint's positions
+    expected: tuple[RegisterValue, ...] = ()
+    """Register values of the robot file that the start compares and does not write."""
+    homing_offset: int | None = None
+    """Homing Offset that reference and ticks contain; None: unknown before the start. See `placement`."""
+    extended: bool = False
+    """Position control counts turns, although the joint is not continuous; the start finds the turn."""
 
     @property
     def own_name(self) -> str:
@@ -213,9 +223,25 @@ class ServoPlan(msgspec.Struct, frozen=True):
         return {setting.name: setting.value for setting in self.settings}
 
     @property
+    def turn_ticks(self) -> int:
+        """Ticks of one turn of the servo."""
+        return round(math.tau / self.rad_per_tick)
+
+    def moved(self, ticks: int) -> ServoPlan:
+        """Return the plan of the same joint for a servo whose position is this many ticks higher."""
+        ends = {"lower_tick": self.lower_tick + ticks, "upper_tick": self.upper_tick + ticks}
+        modes = tuple(replace(mode, **ends) for mode in self.modes)
+        return replace(self, reference=self.reference + ticks * self.rad_per_tick, modes=modes, **ends)
+
+    @property
     def position_per_tick(self) -> float:
         """Movement of the joint per tick of the servo's position, rad or m."""
         return self.rad_per_tick * self.ratio
+
+    @property
+    def zero(self) -> float:
+        """Position of the joint, rad or m, that is subtracted from that of its servo's ticks."""
+        return self.direction * self.reference * self.ratio
 
     @property
     def wraps(self) -> bool:

@@ -42,13 +42,16 @@ AX = Path("runtime/dxlwire/control_table/tables/protocol1/AX-12A.toml").read_tex
 
 
 def full_range(table: ControlTable) -> BusPlan:
-    """Return the plan of one joint that moves as far as the factory's limits of its servo let it."""
+    """Return the plan of one joint that moves nearly as far as the factory's limits of its servo let it.
+
+    Two ticks are left for a Homing Offset.
+    """
     ends = [table.min_tick, table.max_tick]
     for name, end in (("min_position_limit", 0), ("max_position_limit", 1)):
         if name in table.items:
             initial = table.items[name].initial or 0
             ends[end] = initial if end else max(ends[end], initial)
-    lower, upper = (end * table.rad_per_tick for end in ends)
+    lower, upper = ((end + left) * table.rad_per_tick for end, left in zip(ends, (2, -2), strict=True))
     joint = Wiring("joint", 0, 1, table, 0.0, 1, lower, upper, continuous=False)
     plan = bus_plan(
         name="main",
@@ -147,6 +150,8 @@ def test_a_setting_of_another_program_is_refused_reported_or_silent_as_its_table
     for item in table.items.values():
         if item.access == "R" or item.name in ADDRESSES or item.name.endswith(tuple("23456789")):
             continue
+        if item.name == "multi_turn_offset":
+            continue  # it counts only where the joint is continuous; `cases/checks.txt` has both
         rule, start = item.deviation, bench.servo.registers.ticks(item.name)
         values = {another_value(item, start): rule.judgement} | dict.fromkeys(rule.refused, "refuse")
         for value, judgement in values.items():

@@ -294,10 +294,9 @@ def test_a_device_of_another_model_or_none_at_all_ends_the_start_with_a_sentence
     wrong = tuple(replace(one, model_number=65_000, model="generic") for one in plan.devices)
     rig = make_rig(plan)
     rig.buses[0].servos[-1].silence()
-    hardware = rig.hardware
-    hardware._plans = hardware._start_up._plans = (replace(plan, devices=wrong),)
+    rig.hardware._lines.buses[0].plan = replace(plan, devices=wrong)
     with pytest.raises(StartUpError) as caught:
-        hardware.start()
+        rig.hardware.start()
     assert str(caught.value).splitlines() == [
         "device_0 (ID 101 on bus main) has model number 1060 (XL430-W250), not 65000 (generic): "
         "correct `model` or the ID",

@@ -104,9 +104,9 @@ def with_a_timer(tmp_path, latency_ms, port="sim"):
     path.write_text(ROBOT)
     plan = plan_of(path, duration_s=0.2)
     robot = VirtualRobot(plan)
-    start_up = robot.robot.hardware._start_up
-    assert start_up._plans[0] is plan.buses[0]
-    start_up._plans = [replace(plan.buses[0], latency_ns=latency_ms * MS, port=port)]
+    (bus,) = robot.robot.hardware._lines.buses
+    assert bus.plan is plan.buses[0]
+    bus.plan = replace(bus.plan, latency_ns=latency_ms * MS, port=port)
     return robot
 
 

@@ -129,10 +129,10 @@ def test_firmware_before_an_item_may_refuse_reads_of_it():
     newer = [item.name for item in items if item.firmware > 44 and not item.name.startswith("indirect")]
     assert "startup_configuration" in newer
     rig = make_rig(make_x((1,)), firmware=44)
-    rig.servo(1).poke("homing_offset", 5)
+    rig.servo(1).poke("drive_mode", 4)
     refuse_reads(rig.servo(1), *newer)
     (problem,) = rig.refused()
-    assert "Homing Offset (20) = 5" in problem
+    assert "Drive Mode (10) = 4" in problem
     starts = {int.from_bytes(packet[8:10], "little") for packet in rig.into_bus() if packet[7] == 0x02}
     assert 60 not in starts
 

@@ -67,10 +67,10 @@ def _joint(content: FileContent, name: str, model: str, draft: RobotDraft) -> Jo
     if high - low > 4096 or drive not in (0, 1):
         what = f"range {low} to {high} or drive_mode {drive} of {name} is not one of a Dynamixel servo"
         raise content.refusal(what, "check which arm the file is of", name)
-    if offset or drive:
+    if drive:
         draft.remarks.append(
-            f"homing_offset {offset} and drive_mode {drive} of {name}: reference and direction have them; "
-            "a run needs 0 in both registers, which `dxlrun servo PORT ID set` writes"
+            f"drive_mode {drive} of {name}: its direction has it; a run needs 0 in the register, which "
+            "`dxlrun servo PORT ID set` writes"
         )
     middle = ((low + high) / 2 - offset) * _TICK_DEG
     return JointDraft(

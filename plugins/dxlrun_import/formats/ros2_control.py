@@ -62,7 +62,7 @@ _REASONS = {
     "Drive Mode": "its direction is taken over; a run needs 0 in the register",
     "Profile Velocity": "dxlrun sends the speed with each goal",
     "Profile Acceleration": "write `limits: {acceleration: ...}`",
-    "Homing Offset": "the reference has it; a run needs 0 in the register",
+    "Homing Offset": "the reference has it; a run reads the register",
     "Min Position Limit": "limits of the joint have it",
     "Max Position Limit": "limits of the joint have it",
     "Goal Current": "write a controller that commands efforts",

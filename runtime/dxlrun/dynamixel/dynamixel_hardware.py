@@ -100,7 +100,7 @@ class DynamixelHardware:
         """
         states, goals = arrays.states, arrays.goals
         self._lines = lines
-        self._plans, self._buses = lines.plans, lines.buses
+        self._buses = lines.buses
         self._clock = lines.clock
         self._now_ns = lines.clock.now_ns
         self._states = states
@@ -124,7 +124,7 @@ class DynamixelHardware:
         """
         reports = WireReports(events)
         self._idle = tuple(IdleScheduler(bus, reports) for bus in self._buses)
-        self._samples = Samples(self._plans, states, arrays.sources, reports)
+        self._samples = Samples(lines.plans, states, arrays.sources, reports)
         parts = parts or FeatureParts(FEATURES, (), np.empty(0), {})
         self._safe_end = SafeEnd.import_stages(parts.features, parts.plans)
         self._servos = tuple(
@@ -134,7 +134,7 @@ class DynamixelHardware:
         self._pairs = tuple(zip(self._buses, self._servos, strict=True))
         self._places = {
             servo.row: (servos, index)
-            for plan, servos in zip(self._plans, self._servos, strict=True)
+            for plan, servos in zip(lines.plans, self._servos, strict=True)
             for index, servo in enumerate(plan.servos)
         }
         """Index of each joint's servo on its bus, and the `Servos` of that bus, by row of the joint."""
@@ -340,7 +340,7 @@ class DynamixelHardware:
         for servos in self._servos:
             servos.goals.weaken(fraction)
         for plan, bus, servos, full in zip(
-            self._plans, self._buses, self._servos, self._full_torque, strict=False
+            self._lines.plans, self._buses, self._servos, self._full_torque, strict=False
         ):
             for packet in reduced_torque_limits(plan, full, fraction, servos.goals.modes):
                 with suppress(PortError):  # as for goals: the next read reports the bus
@@ -399,7 +399,7 @@ class DynamixelHardware:
         for sentence in failures:
             self._events.emit_event("hardware", texts.torque_off_not_confirmed(sentence))
         if not failures:
-            count = sum(len(plan.servos) for plan in self._plans)
+            count = sum(len(plan.servos) for plan in self._lines.plans)
             self._events.emit_event("hardware", texts.torque_is_off(count))
         return failures
 
@@ -410,7 +410,7 @@ class DynamixelHardware:
         A servo that its Bus Watchdog has already stopped stays stopped.
         """
         # Disarm first: a silent device can delay the programs by more than the watchdogs' timeout.
-        programs = [limit_patience(watchdog.release_all(plan), any_age=True) for plan in self._plans]
+        programs = [limit_patience(watchdog.release_all(plan), any_age=True) for plan in self._lines.plans]
         for problems in self._lines.run_programs(programs):
             for problem in problems or ():
                 self._events.emit_event("hardware", texts.watchdog_not_disarmed(problem))
@@ -424,7 +424,7 @@ class DynamixelHardware:
         """Disarm the Bus Watchdogs of the servos in `limp`, (bus, ID), which have no torque. The other servos
         must still stop without a host.
         """
-        for plan, bus in zip(self._plans, self._buses, strict=True):
+        for plan, bus in zip(self._lines.plans, self._buses, strict=True):
             servos = [servo for servo in plan.servos if (plan.name, servo.servo_id) in limp]
             for packet in watchdog.to_all(plan, servos, 0):
                 with suppress(PortError):  # an armed servo without a host stops, which is safe
@@ -474,7 +474,7 @@ class DynamixelHardware:
                 return
 
     def _report_plain_reads(self) -> None:
-        for plan, servos in zip(self._plans, self._servos, strict=True):
+        for plan, servos in zip(self._lines.plans, self._servos, strict=True):
             for group in servos.reads.given_up:
                 names = ", ".join(plan.member_name(index) for index in plan.groups[group])
                 self._events.emit_event(plan.name, texts.fast_reads_given_up(plan.name, MOST_BROKEN, names))
@@ -490,14 +490,14 @@ class DynamixelHardware:
         """
         for pause_ns in FIRST_READS_NS:
             if pause_ns:
-                self._lines.run_programs([pause(pause_ns) for _ in self._plans])
+                self._lines.run_programs([pause(pause_ns) for _ in self._lines.plans])
             self.read_states()
             self._start_up.raise_failures()
             if not any(servos.silent for servos in self._servos):
                 break
         problems = [
             f"{', '.join(servos.silent)} did not answer {when}: {choose_remedy(plan.port, CHECK)}"
-            for plan, servos in zip(self._plans, self._servos, strict=True)
+            for plan, servos in zip(self._lines.plans, self._servos, strict=True)
             if servos.silent
         ]
         if problems:

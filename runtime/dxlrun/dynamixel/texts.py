@@ -20,6 +20,11 @@ def servo_found(model: str, servo_id: int, bus: str, firmware: int) -> str:
 
 
 @event_text(EventCode.SETUP, Severity.INFO)
+def turn_found(servo: str, raw: int, turn: int) -> str:
+    return f"{servo} counts turns: it reports position {raw}, which is in turn {turn} of its joint's travel"
+
+
+@event_text(EventCode.SETUP, Severity.INFO)
 def torque_limit_restored(register: str, before: int, now: int) -> str:
     return f"{register} was restored from {before} to {now}"
 

@@ -23,6 +23,7 @@ FEATURES = (
     Feature("sensors", "dxlrun.features.sensors"),
     Feature("transmissions", "dxlrun.features.mechanics"),
     Feature("registers", "dxlrun.features.registers"),
+    Feature("homing_offset", "dxlrun.features.homing_offset"),
     Feature("recording", "dxlrun.features.recording"),
 )
 """Built-in features, in the order in which every stage calls them and in which their states are recorded."""

@@ -74,7 +74,7 @@ class ModeShaft(Shaft):
         self._scale = {name: item.scale for name, item in items.items()}
         self._rad_per_tick = memory.table.rad_per_tick
         self._sign, self._offset = 1, 0
-        memory.watch_items(("drive_mode", "homing_offset"), self._orient)
+        memory.watch_items(("drive_mode", "homing_offset", "operating_mode"), self._orient)
 
     def within_a_turn(self, angle: float) -> float:
         """Return the angle, rad, that the servo shows after power-up: within one turn of its encoder, 0 to
@@ -132,6 +132,10 @@ class ModeShaft(Shaft):
     def _orient(self) -> None:
         self._sign = -1 if self.memory.get("drive_mode") & REVERSE else 1
         self._offset = self.memory.ticks("homing_offset") if "homing_offset" in self.memory else 0
+        # Position control ignores more than a quarter turn (e-Manual XM430-W350, Homing Offset (20)).
+        ignored = abs(self._offset) * self._rad_per_tick > math.pi / 2 + 1e-9
+        if ignored and self.memory.get("operating_mode") == OperatingMode.POSITION:
+            self._offset = 0
 
     @property
     def _controls_position(self) -> bool:

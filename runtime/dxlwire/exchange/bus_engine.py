@@ -76,7 +76,7 @@ class BusEngine:
 
     def __init__(self, index: int, plan: BusPlan, port: Port, clock: Clock, packets: PacketSink) -> None:
         self.index = index  # Its number in the log
-        self.plan = plan
+        self.plan = plan  # With its servos as `place_servo` placed them
         self.now_ns = clock.now_ns
         self.failure: PortError | None = None
         """Reason why the line is lost; None while it works. A bus with a failure sends and reads nothing."""
@@ -616,15 +616,19 @@ class Lines:
             packets: One sink for all lines, or one for each.
             beat: Called at least every BEAT_NS, not counting one wait.
         """
-        self.plans = tuple(plans)
         self.ports = ports
         self.clock = clock
         self.beat = beat
-        sinks = packets if isinstance(packets, Sequence) else [packets] * len(self.plans)
+        sinks = packets if isinstance(packets, Sequence) else [packets] * len(plans)
         self.buses = tuple(
             BusEngine(index, plan, port, clock, sink)
-            for index, (plan, port, sink) in enumerate(zip(self.plans, ports.ports, sinks, strict=True))
+            for index, (plan, port, sink) in enumerate(zip(plans, ports.ports, sinks, strict=True))
         )
+
+    @property
+    def plans(self) -> tuple[BusPlan, ...]:
+        """Plans of the lines, with their servos as they are placed now."""
+        return tuple(bus.plan for bus in self.buses)
 
     @property
     def failure(self) -> PortError | None:

@@ -80,6 +80,11 @@ class GoalArrays:
         """Current mode of each servo; a servo in UNKNOWN gets no goals."""
         return self._modes
 
+    def place_servos(self, plan: BusPlan) -> None:
+        """Send goals from now on to servos that count from another zero; `plan` differs only in that."""
+        self._plan = plan
+        self.rebuild_writes()
+
     def set_mode(self, index: int, mode: Mode) -> None:
         """Send goals in another mode from now on to the servo at this index in the plan; UNKNOWN: no
         goals.

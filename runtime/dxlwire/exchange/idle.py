@@ -11,6 +11,7 @@ from enum import IntEnum, unique
 from msgspec import structs
 from msgspec.structs import replace
 
+from dxlwire.bus_plan import BusPlan
 from dxlwire.exchange import reports
 from dxlwire.exchange.bus_engine import NEVER, BusEngine
 from dxlwire.exchange.reports import Reason, ReportSink
@@ -76,7 +77,6 @@ class IdleScheduler:
     Every program runs to completion: on a lost line its transactions time out (`abandon`)."""
 
     def __init__(self, bus: BusEngine, reports: ReportSink) -> None:
-        self.plan = bus.plan
         self.bus = bus
         self._reports = reports
         self.now_ns = bus.now_ns
@@ -84,6 +84,11 @@ class IdleScheduler:
         self._current: _Task | None = None
         self._until_ns = 0
         self._count = 0
+
+    @property
+    def plan(self) -> BusPlan:
+        """Plan of the bus, with its servos as they are placed now."""
+        return self.bus.plan
 
     def add(
         self,

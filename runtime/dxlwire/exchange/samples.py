@@ -49,9 +49,7 @@ class Samples:
         self.scale: Floats = np.array([_units(servo) for servo in servos]).reshape(-1, 3).T.copy()
         """SI units per tick of position, velocity and effort, shape (3, servos); that of the velocity
         follows the servo's mode."""
-        self.reference: Floats = np.array(
-            [servo.direction * servo.reference * servo.ratio for servo in servos]
-        )
+        self.reference: Floats = np.array([servo.zero for servo in servos])
         """Offset subtracted from each servo's position, rad or m."""
         self.fresh = np.zeros(len(servos), dtype=np.bool_)
         """True for each servo whose intact reply arrived in this cycle."""
@@ -144,6 +142,10 @@ class BusSamples:
         """Accept the next position of a servo at any distance from the last: a reboot reset its turn
         count."""
         self._samples.recounted_ns[self._here][servo] = self.at_ns[servo]
+
+    def place_servo(self, servo: int, placed: ServoPlan) -> None:
+        """Convert the positions of a servo with another zero from now on."""
+        self._samples.reference[self._here][servo] = placed.zero
 
     def arrived(self, member: int) -> bool:
         """Return True if an intact reply of this member of the plan arrived in this cycle."""

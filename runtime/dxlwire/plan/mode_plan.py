@@ -15,7 +15,7 @@ no-load speed, which a loaded servo does not reach [i]."""
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Literal
 
@@ -99,6 +99,32 @@ def mode_plans(
     if "operating_mode" in table.items:
         return tuple(_by_operating_mode(table, ends, continuous))
     return tuple(_by_angle_limits(table, ends, continuous))
+
+
+def can_count_turns(table: ControlTable) -> bool:
+    """Return True if a model has Extended Position Control Mode in place of Position Control Mode."""
+    return {_POSITION, _EXTENDED} <= set(operating_modes(table))
+
+
+def has_one_turn(found: Mapping[str, int]) -> bool:
+    """Return True if the register values in `found`, by name, select Position Control Mode."""
+    return found.get("operating_mode") == _POSITION
+
+
+def counting_turns(modes: Sequence[ModePlan]) -> tuple[ModePlan, ...]:
+    """Return the plans of modes with Extended Position Control Mode in place of Position Control Mode."""
+    return tuple(
+        replace(
+            mode,
+            operating=tuple(
+                replace(register, value=_EXTENDED)
+                if (register.name, register.value) == ("operating_mode", _POSITION)
+                else register
+                for register in mode.operating
+            ),
+        )
+        for mode in modes
+    )
 
 
 def mode_in(servo: ServoPlan, found: Mapping[str, int]) -> Mode:

@@ -29,12 +29,14 @@ from dxlwire.modes import Mode
 from dxlwire.plan.line import MOST_SPARE, Line
 from dxlwire.plan.mode_plan import (
     LACKS,
+    can_count_turns,
     field,
     mode_plans,
     own_limits,
     position_layout,
     position_reach,
 )
+from dxlwire.plan.placement import OFFSET, extend, place_servo
 from dxlwire.plan.reads import choose_reads, read_budget, read_by
 from dxlwire.transaction import BROADCAST_ID, Transaction
 from dxlwire.wire.dialect import Dialect, dialect_of, sync_writes
@@ -183,6 +185,13 @@ def _servo(joint: Wiring) -> ServoPlan:
         for angle in (joint.lower, joint.upper)
     )
     reach = position_reach(table, joint.continuous)
+    # A joint that crosses raw 0 counts turns, where the model can.
+    extended = (
+        not joint.continuous
+        and can_count_turns(table)
+        and (math.ceil(ends[0] - 1e-6) < reach[0] or math.floor(ends[1] + 1e-6) > reach[1])
+    )
+    reach = position_reach(table, continuous=True) if extended else reach
     # Round inwards so that no goal is outside; 1e-6 ticks absorb the rounding of degrees.
     lower = math.ceil(max(ends[0], reach[0]) - 1e-6)
     upper = math.floor(min(ends[1], reach[1]) + 1e-6)
@@ -193,7 +202,7 @@ def _servo(joint: Wiring) -> ServoPlan:
         replace(mode, effort=None if mode.effort is None else _scaled(mode.effort, effort))
         for mode in mode_plans(table, lower, upper, joint.continuous)
     )
-    return ServoPlan(
+    plan = ServoPlan(
         joint=joint.joint,
         row=joint.row,
         servo_id=joint.servo_id,
@@ -217,11 +226,15 @@ def _servo(joint: Wiring) -> ServoPlan:
         start_mode=_start_mode(joint, modes),
         own_limits=own_limits(table),
         continuous=joint.continuous,
-        settings=joint.settings,
+        settings=tuple(setting for setting in joint.settings if setting.write),
+        expected=tuple(setting for setting in joint.settings if not setting.write),
         ratio=joint.ratio,
         unit=joint.unit,
         name=joint.name,
     )
+    plan = extend(plan, table) if extended else plan
+    offsets = [setting.value for setting in joint.settings if setting.name == OFFSET]
+    return place_servo(plan, table, offsets[0]) if offsets else plan
 
 
 def _scaled(scale: Scale, factor: float) -> Scale:

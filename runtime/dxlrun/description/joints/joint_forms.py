@@ -243,7 +243,10 @@ def servo_keys() -> list[ServoKey[object]]:
 def servo_values(servo: Form, joint: Form | None = None) -> dict[str, object]:
     """Return the values of all features' keys of a servo, by key; missing ones are those of its joint."""
     found = {key.name: getattr(servo, key.name) for key in servo_keys()}
-    return {name: getattr(joint, name) if value is None else value for name, value in found.items()}
+    return {
+        name: value if joint is None or value is not None else getattr(joint, name)
+        for name, value in found.items()
+    }
 
 
 def section_servo(form: type[F]) -> type[F]:

@@ -23,6 +23,7 @@ from dxlrun.dynamixel.servo.registers import format_item, tripped
 from dxlwire.bus_plan import SIMULATED, BusPlan, ServoPlan
 from dxlwire.control_table import (
     ControlItem,
+    ControlTable,
     FoundDeviation,
     HardwareErrors,
     find_deviations,
@@ -32,6 +33,14 @@ from dxlwire.exceptions import help_link
 from dxlwire.modes import Mode
 from dxlwire.plan.line import listen_transaction
 from dxlwire.plan.mode_plan import mode_in
+from dxlwire.plan.placement import (
+    OFFSET,
+    nearest_turn,
+    place_servo,
+    present_offset,
+    reaches_goals,
+    turns_within_limits,
+)
 from dxlwire.plan.reads import servo_read
 from dxlwire.plan.retry import ATTEMPTS, retry
 from dxlwire.transaction import Program, Reply, TransactionOutcome
@@ -58,6 +67,8 @@ class InspectedServo(msgspec.Struct, frozen=True):
 
     plan: BusPlan
     servo: ServoPlan
+    """Plan of the servo, placed with its Homing Offset."""
+    table: ControlTable
     items: Mapping[str, ControlItem]
     values: Mapping[str, int]
     """Integers on the wire, by item. A register that the robot file declares counts with its declared value,
@@ -69,6 +80,15 @@ class InspectedServo(msgspec.Struct, frozen=True):
     def title(self, name: str) -> str:
         """Return the title of an item, such as `Torque Enable (64)`, for messages."""
         return self.items[name].title
+
+
+class ReadableServo(NamedTuple):
+    """A servo that can be read, as the inspection found it."""
+
+    one: Access
+    """Access to the servo as it is placed with its Homing Offset."""
+    mode: Mode  # its present mode, which start-up changes to the start mode before torque on
+    ahead: int  # ticks by which its position increases when start-up sets its registers and its mode
 
 
 class Check(NamedTuple):
@@ -84,7 +104,7 @@ class Check(NamedTuple):
 def _limits(low: str, high: str, names: str) -> Check:
     def fails(found: InspectedServo, lowest: int) -> bool:
         servo, highest = found.servo, found.values[high]
-        if servo.continuous or (found.plan.protocol == 1.0 and lowest >= highest):
+        if servo.continuous or servo.extended or (found.plan.protocol == 1.0 and lowest >= highest):
             return False  # not in joint mode yet: start-up switches it
         return lowest > servo.lower_tick or highest < servo.upper_tick
 
@@ -133,6 +153,30 @@ def _watchdog_sentence(found: InspectedServo, raw: int) -> str:
     return f"{item.title} is {format_item(item, raw)} and {what}; each start clears it"
 
 
+def _offset_sentence(found: InspectedServo, offset: int) -> str:
+    title, wanted, port = found.title(OFFSET), found.servo.homing_offset, found.plan.port
+    command = f"dxlrun servo {port} {found.servo.servo_id} set {OFFSET} {wanted}"
+    how = "" if port == SIMULATED else f" (`{command}`)"
+    link = help_link("another-homing-offset")
+    if found.servo.expected:
+        return (
+            f"has {title} = {offset}, but `{OFFSET}` in the robot file is {wanted}: another program changed "
+            f"it since; write {wanted}{how}, or check `reference` and correct `{OFFSET}`; {link}"
+        )
+    return (
+        f"has {title} = {offset} instead of {wanted} as at the start: another program changed it, or this "
+        f"is another servo; write {wanted}{how}, or start again; {link}"
+    )
+
+
+def _goals_sentence(found: InspectedServo, offset: int) -> str:
+    servo = found.servo
+    return (
+        f"has {found.title(OFFSET)} = {offset}, which moves its goals to {servo.lower_tick}.."
+        f"{servo.upper_tick}, beyond its {found.items['goal_position'].title}: write 0"
+    )
+
+
 CHECKS: tuple[Check, ...] = (
     Check(
         STATUS_ERROR,
@@ -154,6 +198,8 @@ CHECKS: tuple[Check, ...] = (
         _return_delay_sentence,
         refuses=False,
     ),
+    Check(OFFSET, lambda found, offset: offset != found.servo.homing_offset, _offset_sentence),
+    Check(OFFSET, lambda found, _: not reaches_goals(found.servo, found.table), _goals_sentence),
     _limits("min_position_limit", "max_position_limit", "position limits"),
     _limits("cw_angle_limit", "ccw_angle_limit", "angle limits"),
     *(
@@ -203,14 +249,17 @@ that each refuses.
 """
 
 
-def survey(plan: BusPlan, take_over: bool, found: Findings) -> Program[None]:
+def survey(plan: BusPlan, take_over: bool, found: Findings) -> Program[tuple[ServoPlan, ...]]:
     """Check that every servo of a bus is present and fit for torque; add the problems of all servos to
     `found`. Only reads.
+
+    Returns:
+        The plans of the servos as they are placed with their Homing Offsets; without problems those of all.
     """
     yield listen_transaction(LISTEN_NS)
     every = [first_reach(plan, servo) for servo in plan.servos]
     if every and (yield from _echoes(every[0], found)):
-        return
+        return ()
     present: list[Access] = []
     silent: list[ServoPlan] = []
     for one in every:
@@ -221,21 +270,18 @@ def survey(plan: BusPlan, take_over: bool, found: Findings) -> Program[None]:
             present.append(one)
     if silent:
         found.problems.insert(0, _silence(plan, silent))
-    readable: list[tuple[Access, Mode]] = []
+    readable: list[ReadableServo] = []
     for one in present:
-        mode = yield from inspect_servo(one, found, take_over=take_over)
-        if mode is not None:
-            readable.append((one, mode))
+        inspected = yield from inspect_servo(one, found, take_over=take_over)
+        if inspected is not None:
+            readable.append(inspected)
     yield from inspect_states(readable, found)
+    return tuple(each.one.servo for each in readable)
 
 
-def inspect_servo(one: Access, found: Findings, *, take_over: bool) -> Program[Mode | None]:
+def inspect_servo(one: Access, found: Findings, *, take_over: bool) -> Program[ReadableServo | None]:
     """Read the registers of a servo that matter for a start, and add the problems, events and unusual
-    settings to `found`.
-
-    Returns:
-        The present mode of the servo, which start-up changes to the first mode before torque on; None if it
-            cannot be read.
+    settings to `found`. Returns None if the servo cannot be read.
     """
     plan, servo = one.plan, one.servo
     wanted: tuple[str, ...] = _IDENTITY
@@ -257,7 +303,9 @@ def inspect_servo(one: Access, found: Findings, *, take_over: bool) -> Program[M
         values[STATUS_ERROR] = reply.error
     firmware = values["firmware_version"]
     found.add_event(servo.joint, texts.servo_found(servo.model, servo.servo_id, plan.name, firmware))
-    inspected = InspectedServo(plan, servo, one.items, values, one.table.errors, take_over)
+    if servo.homing_offset is None:
+        servo = place_servo(servo, one.table, values.get(OFFSET, 0))
+    inspected = InspectedServo(plan, servo, one.table, one.items, values, one.table.errors, take_over)
     for check in CHECKS:
         if check.item in values and check.fails(inspected, values[check.item]):
             sentence = check.sentence(inspected, values[check.item])
@@ -267,12 +315,14 @@ def inspect_servo(one: Access, found: Findings, *, take_over: bool) -> Program[M
                 found.add_event(servo.joint, texts.register_check_failed(sentence))
     # Torque control mode of Protocol 1.0 is in RAM, and only some models have it: it is not read here.
     mode = mode_in(servo, {"torque_ctrl_mode_enable": 0, **values})
-    for each in deviations(one, values, mode, declared):
+    known = declared if one.servo.homing_offset is None else {*declared, OFFSET}
+    for each in deviations(one, values, mode, known):
         if each.refused:
             found.problems.append(f"{one} {_refusal(one, each)}")
         else:
             found.deviations.append((servo.joint, f"ID {servo.servo_id} on bus {plan.name}", each))
-    return mode
+    ahead = (servo.homing_offset or 0) - present_offset(one.table, read)
+    return ReadableServo(one.placed(servo), mode, ahead)
 
 
 def deviations(
@@ -290,6 +340,8 @@ def deviations(
             item
             for item in one.items.values()
             if item.name not in declared
+            # It counts in multi-turn mode only (e-Manual MX-28, Resolution Divider (22)).
+            and (item.name != "multi_turn_offset" or one.servo.continuous)
             and not any(goal.address <= item.address < goal.address + goal.length for goal in goals)
         ),
         values,
@@ -322,18 +374,18 @@ def _refusal(one: Access, found: FoundDeviation) -> str:
     return f"{wrong}: write {found.factory}{how}; {link}"
 
 
-def inspect_states(servos: Sequence[tuple[Access, Mode]], found: Findings) -> Program[None]:
+def inspect_states(servos: Sequence[ReadableServo], found: Findings) -> Program[None]:
     """Read the position of every servo twice; add a problem if it is outside the limits or jumps faster than
     the servo can move.
 
     Args:
-        servos: Each servo with its present mode.
+        servos: The servos that can be read.
         found: Collects the problems.
     """
     before: dict[int, tuple[int, int]] = {}
     # Two rounds over all servos, so that time passes between the two readings of each servo.
     for again in (False, True):
-        for one, mode in servos:
+        for one, mode, ahead in servos:
             servo = one.servo
             if again and servo.servo_id not in before:
                 continue  # Its first reading failed, which is reported already.
@@ -349,7 +401,9 @@ def inspect_states(servos: Sequence[tuple[Access, Mode]], found: Findings) -> Pr
                     problem = _jump(servo, before[servo.servo_id], (raw, reply.last_ns))
                 else:
                     before[servo.servo_id] = raw, reply.asked_ns
-                    problem = _misplaced(servo, raw, mode)
+                    # In another mode the turn may be another one; the position is checked before torque on.
+                    if servo.extended or mode == servo.start_mode:
+                        problem = find_turn(servo, raw + ahead)[1]
             if problem:
                 found.problems.append(f"{one} {problem}")
 
@@ -436,16 +490,69 @@ def _unreadable(one: Access, title: str, reply: Reply) -> str:
     return f"sends garbled replies to reads: do two servos have its ID?{remedy}"
 
 
-def _misplaced(servo: ServoPlan, raw: int, mode: Mode) -> str:
-    if mode != servo.start_mode:
-        return ""  # the position counts differently in another mode; it is checked before torque on
-    if not servo.torque_at_start:
-        return ""  # a person may move it anywhere; `hold` checks it before torque on
-    if raw > servo.max_tick and not servo.continuous:
-        return f"reports position {raw}, beyond its {servo.max_tick} ticks"
-    if servo.lower_tick - 1 <= raw <= servo.upper_tick + 1:
-        return ""
-    return servo.outside_limits(raw, servo.lower_tick, servo.upper_tick)
+def find_turns(plan: BusPlan, found: Findings) -> Program[list[ServoPlan]]:
+    """Find the turn of each servo of a bus that counts turns, in its start mode; problems go to `found`.
+
+    Returns:
+        The plans of all servos of the bus, as they are placed.
+    """
+    placed: list[ServoPlan] = []
+    for servo in plan.servos:
+        placed.append((yield from place_in_turn(first_reach(plan, servo), found)))
+    return placed
+
+
+def place_in_turn(one: Access, found: Findings) -> Program[ServoPlan]:
+    """Read the position of a servo that counts turns, and return its plan in the turn that it is in.
+
+    Problems and an event with the turn go to `found`. Any other servo is not read.
+    """
+    servo = one.servo
+    if not servo.extended:
+        return servo
+    reply = yield from retry(servo_read(one.line, servo))
+    if not reply.answered:
+        found.problems.append(f"{one} did not answer when its turn was read")
+        return servo
+    raw = servo.state.position.tick(reply.parameters)
+    placed, problem = find_turn(servo, raw)
+    if problem:
+        found.problems.append(f"{one} {problem}")
+    turn = (placed.lower_tick - servo.lower_tick) // servo.turn_ticks
+    if turn:
+        found.add_event(servo.joint, texts.turn_found(str(one), raw, turn))
+    return placed
+
+
+def find_turn(servo: ServoPlan, raw: int) -> tuple[ServoPlan, str]:
+    """Return the plan of a servo in the turn in which `raw` ticks are within its limits, and the problem,
+    empty if there is none.
+
+    A servo that starts limp may be beyond its limits, because a person may move it anywhere; `hold` checks it
+    before torque on.
+    """
+    if servo.extended:
+        turns = turns_within_limits(servo, raw)
+        if len(turns) > 1:
+            return servo, _ambiguous(turns, raw)
+        servo = turns[0] if turns else nearest_turn(servo, raw)
+    least, most = servo.lower_tick - 1, servo.upper_tick + 1
+    if not servo.torque_at_start or least <= raw <= most:
+        return servo, ""
+    if not (servo.continuous or servo.extended) and raw - (servo.homing_offset or 0) > servo.max_tick:
+        return servo, f"reports position {raw}, beyond its {servo.max_tick} ticks"
+    return servo, servo.outside_limits(raw, servo.lower_tick, servo.upper_tick)
+
+
+def _ambiguous(turns: Sequence[ServoPlan], raw: int) -> str:
+    one, turn = turns[0], turns[0].turn_ticks
+    found = sorted(each.joint_position(raw) for each in turns)
+    ends = sorted(map(one.joint_position, (one.upper_tick - turn + 1, one.lower_tick + turn - 1)))
+    least, most = map(one.position_text, ends)
+    return (
+        f"is at {' or '.join(map(one.position_text, found))}, each within its limits, and does not know its "
+        f"turn: move it between {least} and {most} by hand; {help_link('a-joint-does-not-know-its-turn')}"
+    )
 
 
 def _jump(servo: ServoPlan, before: tuple[int, int], after: tuple[int, int]) -> str:

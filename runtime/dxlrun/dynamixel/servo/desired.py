@@ -11,6 +11,7 @@ from collections.abc import Callable
 from functools import partial
 
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from dxlrun.dynamixel import texts
@@ -20,7 +21,7 @@ from dxlrun.dynamixel.servo.life import Life
 from dxlrun.dynamixel.servo.reboots import Reboots
 from dxlrun.dynamixel.servo.registers import merged, read_registers, write_registers
 from dxlrun.dynamixel.servo.torque_limits import limits_positions, restore_torque_limit
-from dxlwire.bus_plan import RegisterValue
+from dxlwire.bus_plan import RegisterValue, ServoPlan
 from dxlwire.exchange.goal_writes import GoalArrays
 from dxlwire.exchange.idle import Urgency
 from dxlwire.modes import Mode
@@ -48,7 +49,6 @@ class DesiredState:
         """Start with the modes and registers of the plan; `mode` is the robot's array of the joints' present
         modes, which this object fills.
         """
-        self._servos = life.plan.servos
         self._life = life
         self._goals = goals
         self._reboots = reboots
@@ -56,6 +56,20 @@ class DesiredState:
         self._modes = [servo.start_mode for servo in self._servos]
         self._changing = [False] * len(self._servos)
         self._settings = [servo.settings for servo in self._servos]
+
+    @property
+    def _servos(self) -> tuple[ServoPlan, ...]:
+        return self._life.bus.plan.servos
+
+    def place_servo(self, index: int, servo: ServoPlan) -> None:
+        """Use a plan of a servo from now on whose reference and ticks count from another zero."""
+        bus, samples = self._life.bus, self._life.reads.samples
+        if servo == bus.plan.servos[index]:
+            return
+        servos = (*bus.plan.servos[:index], servo, *bus.plan.servos[index + 1 :])
+        bus.plan = replace(bus.plan, servos=servos)
+        samples.place_servo(index, servo)
+        self._goals.place_servos(bus.plan)
 
     def mode(self, index: int) -> Mode:
         """Return the desired mode of a servo: its present mode, or the one into which it will change."""

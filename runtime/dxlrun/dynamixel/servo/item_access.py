@@ -229,6 +229,10 @@ class Access(ItemAccess):
         """Return the number of readable bytes from an address on, at most MOST_SPARE."""
         return _spare(self.servo.model, self.plan.protocol, end)
 
+    def placed(self, servo: ServoPlan) -> Access:
+        """Return access to the same servo with a plan whose ticks count from another zero."""
+        return Access(self.plan, servo, self.line)
+
     def read_torque(self) -> Program[Reply]:
         """Read Torque Enable, with up to three attempts; return the reply."""
         return self.read_bytes(self.servo.torque_address, 1)

@@ -236,10 +236,10 @@ class Life:
         """
         count = len(idle.plan.servos)
         self._all_torqued = b"\1" * count
-        self.plan = idle.plan
         self.events = events
         self.parts = parts
         self.idle = idle
+        self.bus = idle.bus  # its plan has the servos as they are placed now
         self.reads = reads  # the cyclic reads, without OFFLINE servos
         self.states = [ServoState.LIMP] * count  # state of each servo
         self.losses: dict[int, OfflineServo] = {}  # record of each OFFLINE servo, by index
@@ -270,7 +270,7 @@ class Life:
         self.torqued[index] = after in GETS_GOALS
         if after is not before:
             self._show(index, _SHOWN[after])
-        slow = RETURN_SPEED * self.plan.servos[index].ratio
+        slow = RETURN_SPEED * self.bus.plan.servos[index].ratio
         self.ceiling[index] = slow if after in _SLOW else np.nan
         loss = self.losses.get(index)
         if event is ServoEvent.LOST:
@@ -351,11 +351,11 @@ class Life:
 
     def access_servo(self, index: int) -> Access:
         """Return access to a servo's items with the timeouts of the plan."""
-        return access_servo(self.plan, self.plan.servos[index])
+        return access_servo(self.bus.plan, self.bus.plan.servos[index])
 
     def servo_name(self, index: int) -> str:
         """Return the label of a servo for messages: joint, ID and bus."""
-        return self.plan.label(self.plan.servos[index])
+        return self.bus.plan.label(self.bus.plan.servos[index])
 
     def do(self, index: int, program: Program[None], what: str, urgency: Urgency = Urgency.REPAIR) -> None:
         """Schedule a program for a servo in idle time; `what` names its object in messages, such as `torque
@@ -365,9 +365,9 @@ class Life:
 
     def report_event(self, index: int, event: EventBody) -> None:
         """Log an event of a servo; its source is the servo's joint."""
-        self.events.emit_event(self.plan.servos[index].joint, event)
+        self.events.emit_event(self.bus.plan.servos[index].joint, event)
 
     def report_limp(self, index: int, enabled: int) -> None:
         """Log that a servo was found without torque; `enabled` is the value of its torque enable."""
-        address = self.plan.servos[index].torque_address
+        address = self.bus.plan.servos[index].torque_address
         self.report_event(index, texts.torque_lost(self.servo_name(index), address, enabled))

@@ -8,7 +8,8 @@ repeatedly; or it had torque before a reboot that a client requested.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 
 from msgspec.structs import replace
 
@@ -16,13 +17,13 @@ from dxlrun.dynamixel import texts
 from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.remedies import CHECK, choose_remedy
 from dxlrun.dynamixel.servo import mode_switches, watchdog
-from dxlrun.dynamixel.servo.checks import inspect_servo, inspect_states
+from dxlrun.dynamixel.servo.checks import inspect_servo, inspect_states, place_in_turn
 from dxlrun.dynamixel.servo.desired import DesiredState
 from dxlrun.dynamixel.servo.item_access import Access
 from dxlrun.dynamixel.servo.life import Done, Life, OfflineServo, ServoEvent, ServoState
 from dxlrun.dynamixel.servo.reboots import Reboots
 from dxlrun.dynamixel.servo.registers import write_registers
-from dxlwire.bus_plan import RegisterValue
+from dxlwire.bus_plan import RegisterValue, ServoPlan
 from dxlwire.modes import Mode
 from dxlwire.plan.retry import ATTEMPTS, limit_patience, retry
 from dxlwire.transaction import Program, Reply, TransactionOutcome
@@ -80,7 +81,7 @@ class OfflineRecovery:
         for index, loss in sorted(self.life.losses.items()):
             if loss.reboot is not None and loss.reboot.until_ns <= now:
                 text = f"did not answer within {REBOOT_NS * 1e-9:g} s after its reboot"
-                remedy = choose_remedy(self.life.plan.port, CHECK)
+                remedy = choose_remedy(self.life.bus.plan.port, CHECK)
                 self._answer(index, loss, f"{text}: {remedy}; dxlrun probes it until it is ready")
 
     def switch_off(self, index: int, done: Done) -> None:
@@ -120,7 +121,7 @@ class OfflineRecovery:
             reply = yield from retry(read)
         event = None
         if reply.outcome is TransactionOutcome.GARBLED:
-            remedy = choose_remedy(life.plan.port, " If not, check its cable", simulated="")
+            remedy = choose_remedy(life.bus.plan.port, " If not, check its cable", simulated="")
             event = texts.servo_garbled(life.servo_name(index), remedy)
         if reply.outcome not in (TransactionOutcome.TIMEOUT, TransactionOutcome.GARBLED):
             found = Findings()
@@ -145,7 +146,7 @@ class OfflineRecovery:
         """Bring a servo that answered a probe to its desired registers and mode; return (has torque, mode).
         Problems go to `found`.
         """
-        life, one, servo = self.life, self.life.access_servo(index), self.life.plan.servos[index]
+        life, one, servo = self.life, self.life.access_servo(index), self.life.bus.plan.servos[index]
         if self.reboots.detect_reboot(index, reply) is None:
             enabled = yield from one.read_torque()
             loss = life.losses.get(index)
@@ -165,7 +166,8 @@ class OfflineRecovery:
             if loss is not None and not loss.limp_reported:
                 loss.limp_reported = True
                 life.report_event(index, texts.turns_lost(life.servo_name(index), servo.joint))
-        torqued = yield from rejoin(one, found, mode, self.desired.settings(index), torque=torque)
+        place = partial(self.desired.place_servo, index)
+        torqued = yield from rejoin(one, found, mode, self.desired.settings(index), place, torque=torque)
         if not found.problems:
             yield from self.desired.read_limits(index)
             yield from self.desired.restore_torque_limit(index, mode, found)
@@ -184,7 +186,7 @@ class OfflineRecovery:
             return False
         if loss.reboot is not None:
             return loss.reboot.had_torque
-        return self.life.plan.servos[index].torque_on_return and not self.reboots.exhausted(index)
+        return self.life.bus.plan.servos[index].torque_on_return and not self.reboots.exhausted(index)
 
     def _take_back(self, index: int, loss: OfflineServo, torqued: bool, mode: Mode) -> None:
         life, back = self.life, texts.servo_back_limp
@@ -197,7 +199,7 @@ class OfflineRecovery:
         else:
             life.on(index, ServoEvent.TORQUE_GIVEN)
             back = texts.servo_back_holding
-        if loss.rebooted and life.plan.servos[index].continuous:
+        if loss.rebooted and life.bus.plan.servos[index].continuous:
             life.reads.samples.restart_count(index)
         self.desired.returned(index, mode)
         life.report_event(index, back(life.servo_name(index)))
@@ -209,7 +211,7 @@ class OfflineRecovery:
             life.report_limp(index, 0)
         problem = "" if loss.rebooted else "answers, but did not reboot"
         if loss.reboot is not None and loss.reboot.had_torque and not (torqued or loss.released):
-            joint = life.plan.servos[index].joint
+            joint = life.bus.plan.servos[index].joint
             problem = problem or f"is back and limp; switch its torque on with `dxlrun torque on {joint}`"
         self._answer(index, loss, problem)
 
@@ -225,7 +227,13 @@ def ignore(problem: str) -> None:
 
 
 def rejoin(
-    one: Access, found: Findings, mode: Mode, registers: Sequence[RegisterValue], *, torque: bool
+    one: Access,
+    found: Findings,
+    mode: Mode,
+    registers: Sequence[RegisterValue],
+    place: Callable[[ServoPlan], None],
+    *,
+    torque: bool,
 ) -> Program[bool]:
     """Bring one servo that was lost or reset into the run again: check it, write its registers and mode, then
     hold it.
@@ -239,6 +247,7 @@ def rejoin(
         found: Collects the problems.
         mode: Desired mode.
         registers: Desired registers, in the order of writing.
+        place: Called with the plan of the servo in the turn in which it is now.
         torque: True: switch torque on.
 
     Returns:
@@ -246,7 +255,7 @@ def rejoin(
     """
     seen = Findings()  # Drop the events, which a start has logged; but report settings that changed since.
     if (present := (yield from inspect_servo(one, seen, take_over=True))) is not None:
-        yield from inspect_states([(one, present)], seen)
+        yield from inspect_states([present], seen)
     if seen.problems:
         found.problems += seen.problems
         return False
@@ -255,6 +264,10 @@ def rejoin(
     yield from write_registers(one, registers, found)
     if not found.problems and (problem := (yield from mode_switches.enter_mode(one, mode, again=False))):
         found.problems.append(f"{one} {problem}")
+    if not found.problems:
+        placed = yield from place_in_turn(one, found)
+        place(placed)
+        one = one.placed(placed)
     enabled = yield from one.read_torque()
     if not enabled.answered:
         found.problems.append(f"{one} did not answer when its torque was read")

@@ -77,7 +77,7 @@ class Reboots:
     """
 
     def __init__(self, life: Life) -> None:
-        count = len(life.plan.servos)
+        count = len(life.bus.plan.servos)
         self._life = life
         self._lit: list[int | None] = [None] * count
         """Value of each servo's LED before `arm_detection` lit it; None: the servo is not watched."""
@@ -164,7 +164,7 @@ class Reboots:
                 return
         event = texts.servo_rebooted(life.servo_name(index))
         if self._counts[index].count_reboot(life.now_ns()):
-            remedy = choose_remedy(life.plan.port, "check its supply")
+            remedy = choose_remedy(life.bus.plan.port, "check its supply")
             event = texts.servo_reboots_repeatedly(life.servo_name(index), remedy)
         life.report_event(index, event)
 

@@ -7,6 +7,8 @@ switched off stays limp until a client requests torque again.
 
 from __future__ import annotations
 
+from functools import partial
+
 from dxlrun.dynamixel import texts
 from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.servo import mode_switches, watchdog
@@ -108,7 +110,9 @@ class Requests:
         yield from self._reboots.tick(index)
         yield from watchdog.disarm(one)
         mode = self._desired.mode(index)
-        yield from rejoin(one, found, mode, self._desired.settings(index), torque=False)
+        place = partial(self._desired.place_servo, index)
+        yield from rejoin(one, found, mode, self._desired.settings(index), place, torque=False)
+        one = self._life.access_servo(index)
         found.log(self._life.events)
         if found.problems:
             return "; ".join(problem.removeprefix(name) for problem in found.problems), mode

@@ -25,6 +25,7 @@ from dxlrun.dynamixel.servo.requests import Requests
 from dxlrun.dynamixel.servo.slow_registers import SlowReads
 from dxlrun.dynamixel.servo.watchdog_monitor import WatchdogMonitor
 from dxlrun.plan.loop_plan import ServoLimit
+from dxlwire.bus_plan import BusPlan
 from dxlwire.control_table import find_table
 from dxlwire.exchange.cyclic_reads import CyclicReads
 from dxlwire.exchange.goal_writes import GoalArrays
@@ -62,7 +63,6 @@ class Servos:
     ) -> None:
         """Create the objects of the bus and its features' parts, from `parts`, the features of the robot."""
         plan, count = idle.plan, len(idle.plan.servos)
-        self._plan = plan
         self._bus = idle.bus
         self._events = events
         self._samples = samples
@@ -99,6 +99,10 @@ class Servos:
         self._unrequested_at_ns = -UNREQUESTED_EVENT_NS
         self._lone, self._lone_ns = 0, 0
         self._line_lost = False
+
+    @property
+    def _plan(self) -> BusPlan:
+        return self.life.bus.plan
 
     @property
     def silent(self) -> list[str]:

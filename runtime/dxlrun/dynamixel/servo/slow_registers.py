@@ -33,10 +33,10 @@ class SlowReads:
         self._life = life
         self._reboots = reboots
         self._states = states
-        self._round = _round(life.plan)
+        self._round = _round(life.bus.plan)
         self._next = 0
         self._reading = False
-        self._interval_ns = life.plan.slow_period_ns // max(len(self._round), 1)
+        self._interval_ns = life.bus.plan.slow_period_ns // max(len(self._round), 1)
         self._due_ns = 0
         self._known: dict[tuple[int, str], int] = {}
         self._hot: set[int] = set()  # servos near their temperature limit
@@ -79,7 +79,7 @@ class SlowReads:
                 self._note(index, item, values[item.name])
 
     def _note(self, index: int, item: ControlItem, raw: int) -> None:
-        states, row = self._states, self._life.plan.servos[index].row
+        states, row = self._states, self._life.bus.plan.servos[index].row
         before = self._known.get((index, item.name))
         self._known[index, item.name] = raw
         state = SLOW_STATES.get(item.name)

@@ -21,7 +21,7 @@ from dxlrun.dynamixel.bus_part import BusStage
 from dxlrun.dynamixel.findings import Findings
 from dxlrun.dynamixel.remedies import choose_remedy, describe_late_start
 from dxlrun.dynamixel.servo import mode_switches, watchdog
-from dxlrun.dynamixel.servo.checks import survey
+from dxlrun.dynamixel.servo.checks import find_turns, survey
 from dxlrun.dynamixel.servo.item_access import Access, access_servo, first_reach
 from dxlrun.dynamixel.servo.registers import settle_bus
 from dxlrun.dynamixel.servo.servo_supervision import Servos
@@ -78,7 +78,6 @@ class StartUp:
     def __init__(
         self, lines: Lines, servos: Sequence[Servos], events: EventSink, features: Sequence[Feature]
     ) -> None:
-        self._plans = lines.plans
         self._lines = lines
         self._servos = servos
         self._events = events
@@ -86,24 +85,35 @@ class StartUp:
         self._times = [ReplyLateness() for _ in lines.plans]
         """Lateness of the replies on each bus, from which slow adapters are found."""
 
+    @property
+    def _plans(self) -> tuple[BusPlan, ...]:
+        return self._lines.plans
+
     def check_servos(self, take_over: bool) -> None:
         """Check every servo, write registers and modes as planned, and read the servos' return delays; torque
         is not switched on.
         """
         found = [Findings() for _ in self._plans]
-        self._run(lambda plan, found: survey(plan, take_over, found), found)
+        placed = self._run(lambda plan, found: survey(plan, take_over, found), found)
         for _, stage in stages(BusStage, self._features):
             self._run(stage.inspect, found)
         self._judge(found)
         # Refuse before any register is written.
         _refuse(self._late_replies(), for_replies=True)
+        self._place(placed)
         self.stage(settle_bus)
         settled = self.stage(mode_switches.settle_modes)
+        self._place(self.stage(find_turns))
         for servos, limits in zip(self._servos, settled, strict=True):
             for index, own in enumerate(limits):
                 servos.goals.set_limits(index, own)
         self._probe_reads()
         self.stage(watchdog.disarm_all)
+
+    def _place(self, placed: Sequence[Sequence[ServoPlan]]) -> None:
+        for servos, plans in zip(self._servos, placed, strict=True):
+            for index, plan in enumerate(plans):
+                servos.desired.place_servo(index, plan)
 
     def engage_servos(self, goals: Commands) -> None:
         """Switch torque on at the present position of every servo that starts with torque, and set `goals` to

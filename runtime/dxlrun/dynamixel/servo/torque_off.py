@@ -17,6 +17,7 @@ from dxlwire.bus_plan import BusPlan, ServoPlan
 from dxlwire.exchange.bus_engine import Lines
 from dxlwire.modes import Mode
 from dxlwire.plan.line import listen_transaction
+from dxlwire.plan.placement import extend
 from dxlwire.plan.retry import limit_patience
 from dxlwire.transaction import Program, Reply, TransactionOutcome
 
@@ -140,6 +141,9 @@ def _stop(one: Access) -> Program[str | None]:
     needs no stop.
     """
     mode = yield from mode_switches.mode_now(one)
+    if mode is Mode.UNKNOWN:
+        # The start may have placed the servo so that it counts turns, which the plan of the file lacks.
+        mode = yield from mode_switches.mode_now(access_servo(one.plan, extend(one.servo, one.table)))
     if mode in _HOLD:
         return None
     torque = yield from one.read_torque()

@@ -24,7 +24,7 @@ class WatchdogMonitor:
         self._life = life
         self._desired = desired
         self._words = life.idle.bus.words
-        self._words[SILENCE_NS] = life.plan.watchdog_ticks * UNIT_NS
+        self._words[SILENCE_NS] = life.bus.plan.watchdog_ticks * UNIT_NS
         self._reviving: set[int] = set()
         """Indices of servos whose revival already waits for idle time; a second late cycle must not schedule
         it again.
@@ -37,7 +37,7 @@ class WatchdogMonitor:
         All servos are armed at once, and again before each read-back, so none trips while the other servos
         are read. A servo that is being revived receives instructions all the time.
         """
-        life, plan = self._life, self._life.plan
+        life, plan = self._life, self._life.bus.plan
         self._words[ASKED_NS] = life.now_ns()
         packets = watchdog.to_all(plan, plan.servos, plan.watchdog_ticks)
         alone = sum(has_watchdog(plan, servo) for servo in plan.servos) == 1
@@ -71,7 +71,7 @@ class WatchdogMonitor:
         words[ASKED_NS] = now_ns
 
     def _revive_all(self, silent_ms: int) -> None:
-        plan, life = self._life.plan, self._life
+        plan, life = self._life.bus.plan, self._life
         armed = [
             index
             for index, servo in enumerate(plan.servos)

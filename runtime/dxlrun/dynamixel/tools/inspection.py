@@ -184,12 +184,12 @@ def _compare_servos(plan: BusPlan, servos: Sequence[ServoPlan]) -> Program[Findi
 
 
 def stored_registers(table: ControlTable, plan: BusPlan, servo: ServoPlan) -> tuple[RegisterValue, ...]:
-    """Return the EEPROM registers that a servo should have: those that the robot file declares, and the
-    return delay of its bus.
+    """Return the EEPROM registers that a servo should have: those that the robot file declares or expects,
+    and the return delay of its bus.
 
     RAM registers are omitted, because every run writes them.
     """
-    declared = [one for one in servo.settings if one.eeprom]
+    declared = [one for one in (*servo.settings, *servo.expected) if one.eeprom]
     item = table.items.get("return_delay_time")
     if item is not None and all(one.name != item.name for one in declared):
         raw = round(plan.return_delay_ns / 2_000)

@@ -32,6 +32,7 @@ from dxlwire.control_table import (
 from dxlwire.modes import Mode
 from dxlwire.plan.line import LONGEST_RETURN_DELAY_NS, listen_transaction
 from dxlwire.plan.mode_plan import mode_in
+from dxlwire.plan.placement import OFFSET, present_offset
 from dxlwire.plan.planning import Wiring, bus_plan
 from dxlwire.plan.retry import retry
 from dxlwire.transaction import Program, Reply, Transaction, TransactionOutcome
@@ -191,6 +192,15 @@ class OneServo(OneNode):
         finally:
             self.write_registers([self.register(name, value) for name, value in before.items()])
         return f"blinked {times} times"
+
+    def read_offset(self) -> int:
+        """Return the Homing Offset, ticks, that the servo's present position contains in its present mode.
+
+        Raises:
+            ServoFault: The servo does not answer.
+        """
+        names = [name for name in (OFFSET, "operating_mode") if name in self.table.items]
+        return present_offset(self.table, self.read_items(names))
 
     # Mode and plan
 
