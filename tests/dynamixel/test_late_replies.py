@@ -53,7 +53,8 @@ ODD = {
 """Settings that a start reports, each with a value of its own."""
 SILENT = re.compile(
     r"(did|does|do) not (answer|confirm|acknowledge|belong)|no longer answers|answers only|garbled|missed|"
-    r"none of the|is probed once a second|answers again$|(reply was|replies in a row were) lost"
+    r"two-servos-have-one-id$|none of the|is probed once a second|answers again$|"
+    r"(reply was|replies in a row were) lost"
 )
 
 TORQUE_OFF = {"hardware: torque is off on the servo", "torque was switched off again on every servo"}

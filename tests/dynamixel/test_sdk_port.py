@@ -20,6 +20,7 @@ from dxlrun.errors import PortError
 from dxlsim.simulation_plan import BusConfig, ServoConfig
 from dxlwire.bus.sdk_port import StuffedPackets
 from dxlwire.control_table import find_table
+from dxlwire.packets import PacketKind
 from dxlwire.wire import protocol2
 
 LOADED = "import sys; import {}; print(sorted({{'serial', 'dynamixel_sdk'}} & set(sys.modules)))"
@@ -69,14 +70,19 @@ def test_register_whose_bytes_are_a_header_is_written_and_read():
     line = VirtualLine(ServoConfig(1, "XM430-W350", 2.0))
     (found,) = find_servo(tool := ToolLine(line), 1, Search((2.0,), (57_600,)))
     one = OneServo(tool, found)
-    one.write_registers([one.register("homing_offset", -131_073)])  # ff ff fd ff
+    one.write_registers([one.register("homing_offset", -131_073)])
+    assert any(data[10:-2] == b"\xff\xff\xfd\xfd\xff" for data in line.heard)
     assert one.read_items(["homing_offset"]) == {"homing_offset": -131_073}
     assert line.bus.servo(1).registers["homing_offset"] == -131_073 & 0xFFFF_FFFF
 
 
-def test_late_reply_counts_neither_for_another_register_nor_after_a_write():
+def test_late_reply_counts_neither_for_another_register_nor_after_a_write_and_is_logged():
     line = VirtualLine(ServoConfig(1, "XM430-W350", 2.0), rate=1_000_000)
-    (tool := ToolLine(line)).speak(2.0, 1_000_000)
+    log: list[tuple[int, bytes]] = []
+    sink = SimpleNamespace(
+        packet=lambda bus, kind, servo_id, first, last, data: log.append((kind, bytes(data)))
+    )
+    (tool := ToolLine(line, sink)).speak(2.0, 1_000_000)
     items = find_table("XM430-W350").items
     led, limit = (tool.line.read_range(1, items[name].address, 1) for name in ("led", "temperature_limit"))
     turn_on, wrong = (tool.line.write_range(1, items["led"].address, bytes((value,))) for value in (1, 7))
@@ -93,6 +99,9 @@ def test_late_reply_counts_neither_for_another_register_nor_after_a_write():
     assert answered(led, replace(limit, patience_ns=0), delays_ms=(60.5, 5)) == [lost, hot]
     assert answered(led, turn_on, led, delays_ms=(61.5, 0, 5)) == [lost, ("OK", b""), on]
     assert answered(wrong, limit, delays_ms=(60.5, 5)) == [lost, hot]
+    assert [kind for kind, _ in log].count(PacketKind.LATE) == 3
+    sent = [entry.data for entry in line.ledger.entries if entry.direction == "out"]
+    assert b"".join(data for kind, data in log if kind != PacketKind.INSTRUCTION) == b"".join(sent)
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import errno
 import sys
+import time
 from collections.abc import Callable
 from typing import Protocol, Self
 
@@ -28,9 +29,9 @@ MOST_LATENCY_NS = 16_000_000
 (FTDI AN232B-04).
 """
 _MOST_BYTES = 4096  # bytes of one read
-_BLOCK_S = 0.005
-"""Longest time (s) for which a read of pyserial blocks; another time for each read would set up the port
-again on Windows.
+_POLL_S = 0.000_5
+"""Interval (s) at which pyserial is asked for bytes: a timeout for each read would set up the port of Windows
+again.
 """
 
 
@@ -78,7 +79,7 @@ class PyserialLine:
 
         self._path, self.baud_rate = path, baud_rate
         try:
-            self._serial = serial_for_url(path, baud_rate, timeout=_BLOCK_S, exclusive=True)
+            self._serial = serial_for_url(path, baud_rate, timeout=0, exclusive=True)
         except (OSError, ValueError) as error:
             # On Windows, pyserial has the cause in its text alone; a port in use is not permitted there.
             named = {"FileNotFoundError": errno.ENOENT, "PermissionError": errno.EBUSY}
@@ -98,9 +99,8 @@ class PyserialLine:
     def receive_bytes(self, until_ns: int) -> bytes:
         """Wait for bytes until a time of the monotonic clock, and return those that have arrived."""
         try:
-            while not (data := bytes(self._serial.read(self._serial.in_waiting or 1))):
-                if MonotonicClock().now_ns() >= until_ns:
-                    break
+            while not (data := bytes(self._serial.read(_MOST_BYTES))) and time.monotonic_ns() < until_ns:
+                time.sleep(_POLL_S)
         except OSError as error:
             raise self._describe_loss(error) from error
         return data
