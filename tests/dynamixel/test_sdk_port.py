@@ -104,6 +104,25 @@ def test_late_reply_counts_neither_for_another_register_nor_after_a_write_and_is
     assert b"".join(data for kind, data in log if kind != PacketKind.INSTRUCTION) == b"".join(sent)
 
 
+def test_reply_to_an_interrupted_request_does_not_count_for_the_next(monkeypatch):
+    line = VirtualLine(ServoConfig(1, "XM430-W350", 2.0), rate=1_000_000)
+    (tool := ToolLine(line)).speak(2.0, 1_000_000)
+    led, limit = (tool.line.read_range(1, address, 1) for address in (65, 31))
+    for delay_ms in (60, 70):
+        delay_next(line.bus, 1, delay_ms * 1_000_000)
+
+    def interrupt(until_ns):
+        if line.heard:
+            raise KeyboardInterrupt
+        return b""
+
+    with monkeypatch.context() as patch:
+        patch.setattr(line, "receive_bytes", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            tool.heard.exchange(led)
+    assert bytes(tool.heard.exchange(replace(limit, timeout_ns=100_000_000)).parameters) == b"\x50"
+
+
 @pytest.mark.parametrize(
     "module", ["dxlrun.run.loop_process", "dxlrun.run.guardian", "dxlrun.cli.tools.servo"]
 )

@@ -86,6 +86,7 @@ class SdkPort(PortHandler):  # type: ignore[misc]  # the package has no types
             PortError: The line is gone.
         """
         self._strays, self._echoed = 0, False
+        self._note_owed()  # Ctrl-C may have ended the exchange before
         self._receive(0)
         if request.awaited:
             self._hold_back(request)
@@ -111,7 +112,7 @@ class SdkPort(PortHandler):  # type: ignore[misc]  # the package has no types
             plain = self._packets.removeStuffing(plain)
         self._request, self._answer, self.is_using = request, b"", False
         status, result, error = self._packets.txRxPacket(self, plain)
-        answered, self._request = self._request is None, None
+        self._note_owed()
         if not request.awaited:
             return
         if result not in _RESULTS:
@@ -119,13 +120,17 @@ class SdkPort(PortHandler):  # type: ignore[misc]  # the package has no types
         reply.outcome = _RESULTS[result]
         reply.asked_ns = self._owed.asked_ns(request, self._sent_ns)
         (awaited,) = request.awaited
-        if not answered:
-            self._owed.add(request, 0, self._sent_ns)
-        elif result == COMM_SUCCESS:
+        if result == COMM_SUCCESS:
             overhead = self._dialect.OVERHEAD - self._dialect.CHECKSUM
             reply.error, reply.parameters = error, bytes(status[overhead : -self._dialect.CHECKSUM])
             if error and self._dialect.refused(error, len(reply.parameters), awaited.length):
                 reply.outcome = TransactionOutcome.REFUSED
+
+    def _note_owed(self) -> None:
+        """Give up the awaited reply, which may still arrive."""
+        if self._request is not None and self._request.awaited:
+            self._owed.add(self._request, 0, self._sent_ns)
+        self._request = None
 
     def _hold_back(self, request: Transaction) -> None:
         """Wait until the line is quiet, and no late reply can be taken for the reply to a request."""
