@@ -54,6 +54,7 @@ class Robot:
         self.mistakes: list[tuple[str, str, str]] = []
         self.goals_begin = True
         self.file = Path("/nowhere/torso.yaml")
+        self.omitted: list[str] = []
 
     def __enter__(self) -> Robot:
         return self
@@ -112,7 +113,8 @@ class Robot:
             {"name": name, "joints": moved, "motions": motions.get(name, {})}
             for name, moved in JOINTS.items()
         ]
-        return {"file": str(self.file), "groups": {}, "controllers": controllers}
+        omitted = {"omitted": self.omitted} if self.omitted else {}
+        return {"file": str(self.file), "groups": {}, "controllers": controllers} | omitted
 
     def goals(self) -> list[GoalState]:
         return [states[0] for states in self.script.values() if isinstance(states[0], GoalState)]
@@ -168,6 +170,7 @@ def test_goal_at_the_terminal(dxlrun: Dxlrun, robot: Robot, reader: Path, case: 
         "goal": robot.goal,
         "begun": robot.begin,
         "refused": robot.refuse,
+        "omits": robot.omitted.append,
         "no": lambda _: setattr(robot, "goals_begin", False),
         "at": lambda _: setattr(robot, "file", reader / "torso.yaml"),
     }

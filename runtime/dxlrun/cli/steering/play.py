@@ -82,7 +82,7 @@ def play_motions(
             return 0
         found = [_found(robot, motion) for motion in motions]
         files = [each.path for each in found if not each.player]
-        if len(found) > 1 or robot.info()["omitted"]:
+        if len(found) > 1 or _omitted(robot.info()):
             _check_forms(robot, files)
         for _ in range(loop):
             for each in found:
@@ -187,11 +187,15 @@ def _check_forms(robot: RemoteRobot, files: Sequence[Path]) -> None:
     from dxlrun.description.motion import read_motion
 
     info = robot.info()
-    omitted = cast("Sequence[str]", info["omitted"])
     for file in files:
-        motion = read_motion(file, cast("Groups", info["groups"]), omitted)
+        motion = read_motion(file, cast("Groups", info["groups"]), _omitted(info))
         if motion.without:
             print_warning(f"{robot.name}: {file} is played without {', '.join(motion.without)}")
+
+
+def _omitted(info: Mapping[str, object]) -> Sequence[str]:
+    """Return the joints and groups that a run omits; a robot of an earlier version does not report them."""
+    return cast("Sequence[str]", info.get("omitted", ()))
 
 
 def _list(robot: RemoteRobot, chosen: RobotChoice) -> None:
@@ -232,8 +236,7 @@ def _playable(info: Mapping[str, object]) -> Iterator[Playable]:
             yield Playable(name, (player,), joints[player], seconds)
     for file in filter(_has_motions, _files(info)):
         try:
-            omitted = cast("Sequence[str]", info["omitted"])
-            motion = read_motion(file, cast("Groups", info["groups"]), omitted).motion
+            motion = read_motion(file, cast("Groups", info["groups"]), _omitted(info)).motion
         except InputError:
             yield Playable(file.stem, (), (), None, str(file))
             continue
