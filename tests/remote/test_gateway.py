@@ -452,6 +452,7 @@ def test_the_robot_is_shown_with_the_commands_of_its_controllers(desk):
         "file": str(Path("pair.yaml").absolute()),
         "log": "/logs/pair.mcap",
         "servos": {},
+        "omitted": [],
     }
 
 
