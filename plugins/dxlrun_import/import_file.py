@@ -117,6 +117,13 @@ def recognized(content: FileContent) -> FileFormat:
         return found
     if found is not None:
         raise content.refusal(*found.sentence(content.path))
+    own = content.values.keys()
+    if {"buses", "joints"} <= own:
+        fix = f"`dxlrun check {content.path}` checks it, and `dxlrun {content.path}` runs it"
+        raise content.refusal("this is a robot file of dxlrun already", fix)
+    if "motions" in own:
+        fix = f"`dxlrun check ROBOT.yaml --play {content.path}` checks it with its robot"
+        raise content.refusal("this is a motion file of dxlrun already", fix)
     if content.text.lstrip()[:1] == "<":
         _ = content.xml  # raises InputError with the place of the first mistake
     if content.text.strip() and _has_structure(content.text):

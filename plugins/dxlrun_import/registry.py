@@ -28,6 +28,7 @@ FORMATS = (
     robotis_robot.FORMAT,
     workbench.FORMAT,
     workbench.INIT,
+    workbench.MOTION,
     ros2_controllers.FORMAT,
     trajectory.FORMAT,
     keyframes.FORMAT,

@@ -25,6 +25,8 @@ SLACK_DEG = 1.0
 SUSPICIOUS_DEG = 3600.0
 """Position limits beyond ten turns are in another unit, such as ticks."""
 AUTO = "auto"
+MOST_USED = "XM430-W350"
+"""Model of servos for which `auto` is checked"""
 _WIDTH = 118
 
 
@@ -150,6 +152,15 @@ class RobotDraft:
         """
         if not self.joints:
             raise self.content.refusal("the file describes no servo", "give the file that lists the servos")
+        for name, bus in self.buses.items():
+            unnamed = any(joint.bus == name and joint.model == AUTO for joint in self.joints.values())
+            if (
+                unnamed
+                and bus.protocol > 1
+                and bus.baud_rate not in find_table(MOST_USED).baud_rates.values()
+            ):
+                what = f"the file names no models, and servos of the X series have no {bus.baud_rate:_} bit/s"
+                raise self.content.refusal(what, "let `dxlrun scan PORT --output robot.yaml` read the models")
         budget = _compiled(self.content.path, self._text(1.0), urdf)
         possible = SHARE / budget
         rate: float = next((rate for rate in RATES if rate <= possible), 1)

@@ -53,8 +53,8 @@ def test_a_file_of_another_program_is_one_problem_with_its_name(
 
 
 def test_a_log_as_robot_file_names_the_verbs_for_logs(tmp_path: Path) -> None:
-    (tmp_path / "a.mcap").write_bytes(b"\x89MCAP0\r\nxyz")
-    with pytest.raises(InputError, match=r"a recording in MCAP; `dxlrun analyze .*a\.mcap`"):
+    (tmp_path / "a.mcap").write_bytes(b"\x89MCAP0\r\n\x01" + bytes(8) + b"\4\0\0\0ros2\6\0\0\0dxlrun")
+    with pytest.raises(InputError, match=r"a log of dxlrun; `dxlrun analyze .*a\.mcap`"):
         read_robot(tmp_path / "a.mcap", {})
 
 

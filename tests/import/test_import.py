@@ -37,8 +37,33 @@ def test_action_file_is_named_by_its_checksums(working_folder: Path, dxlrun: Dxl
     page[31] = 0xFF  # the checksum makes the sum of a page 255
     (working_folder / "motion.bin").write_bytes(bytes(page) * 256)
     assert "this is an action file of ROBOTIS" in dxlrun("import", "motion.bin").err
-    (working_folder / "motion.bin").write_bytes(bytes(page) * 255 + bytes(512))
+    (working_folder / "motion.bin").write_bytes(bytes(512) + bytes(page) * 255)
+    assert "this is an action file of ROBOTIS" in dxlrun("import", "motion.bin").err
+    (working_folder / "motion.bin").write_bytes(bytes(page) * 128 + bytes(512) * 128)
     assert "the format of this file is not known" in dxlrun("import", "motion.bin").err
+
+
+def test_mcap_files_are_told_apart_by_their_header(working_folder: Path, dxlrun: Dxlrun) -> None:
+    named = {
+        (b"ros2", b"dxlrun 0.1"): "a log of dxlrun; `dxlrun analyze",
+        (b"ros2", b"libmcap 1.4"): "a recording of ROS 2 in MCAP; `dxlrun convert a.mcap motion.yaml",
+        (b"", b"mcap go"): "a recording of another program in MCAP; write one episode as CSV",
+    }
+    for (profile, library), expected in named.items():
+        body = b"".join(len(text).to_bytes(4, "little") + text for text in (profile, library))
+        start = b"\x89MCAP0\r\n\x01" + len(body).to_bytes(8, "little")
+        (working_folder / "a.mcap").write_bytes(start + body + bytes(99))
+        assert f"a.mcap:1:1: this is {expected}" in dxlrun("import", "a.mcap").err
+
+
+def test_motion_of_another_windows_is_read(working_folder: Path, dxlrun: Dxlrun) -> None:
+    """Names are in its encoding, numbers have its decimal comma, and bytes follow the last page."""
+    step = b"step=512 480 0,100 0,400\r\n"
+    page = b"page_begin\r\nname=ma\xf1ana\r\ncompliance=5 5\r\nplay_param=0 0 1 1,5 32\r\n" + step
+    text = b"type=motion\r\nversion=1,01\r\nenable=0 1\r\n" + page + b"page_end\r\n\x99\xdc"
+    (working_folder / "old.mtn").write_bytes(text)
+    said = dxlrun("import", "old.mtn")
+    assert (said.code, "speed: 1.5" in said.out, "time: 0.4 s, pause: 0.1 s" in said.out) == (0, True, True)
 
 
 def test_recordings_are_named_by_their_first_bytes(working_folder: Path, dxlrun: Dxlrun) -> None:

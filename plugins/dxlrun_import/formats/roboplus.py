@@ -11,10 +11,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
 
-from dxlrun.tooling.files import Conversion, FileContent, FileFormat, ImportOptions, Mark
+from dxlrun.tooling.files import Conversion, FileContent, FileFormat, ImportOptions
 from dxlrun_import.checked_values import refused, valid_name
+from dxlrun_import.formats.roboplus_pages import BY_HAND, MotionPage, read_pages
 from dxlrun_import.robot_draft import DraftBus, JointDraft, RobotDraft, wrapped
 
 MIDDLE, STEP_DEG = 512, 300 / 1023  # of an AX-12
@@ -22,27 +22,11 @@ SPEED_DEG = 300.0  # mean speed: the peak of a cubic is 1.5 times as high, and a
 SHORTEST_S = 0.01  # of a step of a keyframe_player
 _UNMOVED = 0x4000
 _USUAL_COMPLIANCE, _COMPLIANCES = 5, range(1, 8)
-_BY_HAND = "write its motions by hand; docs/how-to/import.md"
-
-
-@dataclass
-class MotionPage:
-    """Page of a motion file."""
-
-    mark: Mark
-    number: int
-    title: str = ""
-    compliance: Sequence[float] = ()
-    param: Sequence[float] = (0, 0, 1, 1, 32)
-    steps: list[list[float]] = field(default_factory=list)
-    name: str = ""
-    follower: MotionPage | None = None
-    exit: MotionPage | None = None
 
 
 def convert(content: FileContent, options: ImportOptions) -> Conversion:
     """Convert the pages to motions of a `keyframe_player`, for joints that are named after their IDs."""
-    flags, pages = _read(content)
+    flags, pages = read_pages(content)
     draft = RobotDraft(content, FORMAT.name, options.name)
     draft.buses["main"] = DraftBus(1.0, 1_000_000, comment="guessed: protocol and baud_rate of a Bioloid")
     used = [page for page in pages if page.steps]
@@ -51,7 +35,7 @@ def convert(content: FileContent, options: ImportOptions) -> Conversion:
         for page in used:
             if any(1023 < step[number] < _UNMOVED for step in page.steps):
                 what = f"a position of ID {number} is above 1023, so it is not an AX servo"
-                raise refused(page.mark, what, _BY_HAND)
+                raise refused(page.mark, what, BY_HAND)
         joint = JointDraft(f"joint_{number}", number, content.mark(), "AX-12A")
         joint = joint._replace(registers=_slopes(number, used, draft))
         draft.add_joint(joint._replace(comment="guessed: name, model, direction"))
@@ -130,47 +114,9 @@ def _motion(
     draft.remarks += [f"page {page.name}: {remark}" for remark in remarks]
 
 
-def _read(content: FileContent) -> tuple[list[float], list[MotionPage]]:
-    """Return the flags of the IDs in use, and the pages. Raises InputError with the line."""
-    flags: list[float] = []
-    pages: list[MotionPage] = []
-    is_open = False
-    for number, line in enumerate(content.text.splitlines(), 1):
-        mark = Mark(str(content.path), number, 1)
-        key, _, value = line.strip().partition("=")
-        if key in ("page_begin", "page_end"):
-            is_open = key == "page_begin"
-            pages += [MotionPage(mark, len(pages) + 1)] * is_open
-        elif key == "enable":
-            flags = _numbers(value, mark)
-        elif key == "motor_type" and any(_numbers(value, mark)):
-            raise refused(mark, "it has servos other than AX", _BY_HAND)
-        elif key == "name" and pages:
-            pages[-1].title = value
-        elif key == "step" and pages:
-            pages[-1].steps.append(_numbers(value, mark, len(flags) + 2))
-        elif key in ("compliance", "play_param") and pages:
-            count = 5 if key == "play_param" else None
-            setattr(pages[-1], key.removeprefix("play_"), _numbers(value, mark, count))
-    if is_open:
-        raise refused(pages[-1].mark, "this page has no page_end: the file is cut off", "export it again")
-    return flags, pages
-
-
-def _numbers(text: str, mark: Mark, count: int | None = None) -> list[float]:
-    try:
-        found = [float(word) for word in text.split()]
-    except ValueError:
-        found = [math.nan]
-    if not all(map(math.isfinite, found)):
-        raise refused(mark, f"{text:.40} is not a list of numbers", "export the file again")
-    if count not in (None, len(found)):
-        raise refused(mark, f"{len(found)} numbers are here, but must be {count}", "export the file again")
-    return found
-
-
 def _matches(content: FileContent) -> bool:
-    return content.text.startswith("type=motion") or "\npage_begin\n" in content.text.replace("\r", "")
+    data = content.data.removeprefix(b"\xef\xbb\xbf")
+    return data.startswith(b"type=motion") or b"\npage_begin\n" in data.replace(b"\r", b"")
 
 
 FORMAT = FileFormat("a motion file of RoboPlus", _matches, convert=f"{__name__}:convert")

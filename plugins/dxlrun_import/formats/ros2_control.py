@@ -1,15 +1,15 @@
 """URDF with ros2_control: the servos of a `ros2_control` block, with names and limits of the URDF.
 
 Source: README of ROBOTIS' dynamixel_hardware_interface 1.5: a `gpio` is a servo with its ID and registers, in
-the order of the joints unless a transmission matrix says otherwise. Its 0 is the middle of a servo's travel.
-dynamixel_hardware of dynamixel-community has the ID as parameter `id` of the joint. The page "urdf/XML" of
-ROS has limits, rad and rad/s.
+the order of the joints unless a transmission matrix says otherwise; 0 is the middle of a servo's travel.
+dynamixel_hardware of dynamixel-community has a parameter `id` of the joint. Limits of a URDF are rad, rad/s.
 """
 
 from __future__ import annotations
 
 import math
 import os
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from dxlrun.tooling.files import Conversion, FileContent, FileFormat, ImportOptions
@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
 
 _GAINS = {"Position P Gain", "Position I Gain", "Position D Gain"}
-_SILENT = {"ID", "id", "type", "Operating Mode", "Return Delay Time", *_GAINS}
+_SILENT = {"ID", "id", "type", "Operating Mode", "Return Delay Time", "Torque Enable", "Baud Rate"} | _GAINS
+_SILENT |= {"Min Position Limit", "Max Position Limit"}
 _REVERSED = 1  # bit of Drive Mode
 _MIDDLE_TICKS, _TICK_DEG = 2048, 360 / 4096
 
@@ -44,7 +45,7 @@ def convert(content: FileContent, options: ImportOptions) -> Conversion:
                 draft.remarks.append(f"joint {joint.get('name')}: it has several servos, by a matrix")
             else:
                 draft.add_joint(_joint(content, joint, servo, factor, draft)._replace(bus=bus))
-                for name in _params(servo).keys() - _SILENT:
+                for name in {one for one in _params(servo) if not one.startswith("[")} - _SILENT:
                     unused.setdefault(name, []).append(str(joint.get("name")))
         for gpio in block.iter("gpio"):
             if _params(gpio).get("type", "dxl") != "dxl":
@@ -52,8 +53,8 @@ def convert(content: FileContent, options: ImportOptions) -> Conversion:
     for name, joints in sorted(unused.items()):
         draft.remarks.append(f"{name} of {', '.join(joints)}: {_REASONS.get(name, 'write it as a register')}")
     draft.remarks.append("models: the file names none, and `model: auto` reads them from the servos")
-    rotary = {one.get("name") for one in content.xml.iter("joint") if one.get("type") != "prismatic"}
-    if all(joint.get("name") in rotary for block in blocks for joint, _ in _servos(block)):
+    sliding = {one.get("name") for one in content.xml.iter("joint") if one.get("type") == "prismatic"}
+    if not any(joint.get("name") in sliding for block in blocks for joint, _ in _servos(block)):
         draft.urdf = os.path.relpath(content.path, options.folder)
     return draft.conversion(content.text if draft.urdf else None)
 
@@ -63,8 +64,6 @@ _REASONS = {
     "Profile Velocity": "dxlrun sends the speed with each goal",
     "Profile Acceleration": "write `limits: {acceleration: ...}`",
     "Homing Offset": "the reference has it; a run reads the register",
-    "Min Position Limit": "limits of the joint have it",
-    "Max Position Limit": "limits of the joint have it",
     "Goal Current": "write a controller that commands efforts",
 }
 
@@ -86,27 +85,27 @@ def _joint(
     direction = (-1 if int(servo_number("Drive Mode", "0")) & _REVERSED else 1) * (1 if factor > 0 else -1)
     if abs(abs(factor) - 1) > 1e-9:
         draft.remarks.append(f"joint {name}: its gear of {factor:g}; write `gear_ratio`")
-    limits = None
+    limits = []
     if kind == "prismatic":
         draft.remarks.append(f"joint {name}: a crank makes it linear in ROS; here it has its servo's angle")
     elif limit_number("lower") < limit_number("upper"):
-        limits = math.degrees(limit_number("lower")), math.degrees(limit_number("upper"))
-    if limits is None and {"Min Position Limit", "Max Position Limit"} <= params.keys():
+        limits.append([math.degrees(limit_number("lower")), math.degrees(limit_number("upper"))])
+    if {"Min Position Limit", "Max Position Limit"} <= params.keys():
         ticks = [servo_number(f"{end} Position Limit") - _MIDDLE_TICKS for end in ("Min", "Max")]
-        low, high = sorted(direction * tick * _TICK_DEG for tick in ticks)
-        limits = low, high
+        limits.append(sorted(direction * tick * _TICK_DEG for tick in ticks))
     return JointDraft(
         name,
         int(servo_number("ID" if "ID" in params else "id")),
         content.mark_of(servo),
         reference=180 - servo_number("Homing Offset", "0") * _TICK_DEG,
         direction=direction,
-        limits=limits,
+        limits=(max(low for low, _ in limits), min(high for _, high in limits)) if limits else None,
         velocity=math.degrees(limit_number("velocity")) or None if kind != "prismatic" else None,
         registers={
             item.lower().replace(" ", "_"): int(servo_number(item)) for item in sorted(_GAINS & params.keys())
         },
         continuous=kind == "continuous",
+        limp=params.get("Torque Enable") == "0",
     )
 
 
@@ -138,13 +137,10 @@ def _params(element: Element | None) -> dict[str, str]:
 
 
 def _number(content: FileContent, element: Element, text: str, name: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise refused(content.mark_of(element), f"{name} is {text!r}, but must be a number", "correct it")
-    return value
+    with suppress(ValueError):
+        if math.isfinite(value := float(text)):
+            return value
+    raise refused(content.mark_of(element), f"{name} is {text!r}, but must be a number", "correct it")
 
 
 def _matches(content: FileContent) -> bool:

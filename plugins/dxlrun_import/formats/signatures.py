@@ -17,18 +17,45 @@ _PAGES = (
     "robot with such motions"
 )
 _EPISODE = "write one episode as CSV, with times and joints, and import that; docs/how-to/import.md"
-_ACTION_BYTES, _ACTION_PAGE = 131072, 512
-"""Bytes of ROBOTIS' action file: 256 pages of 512"""
+_ACTION_BYTES, _ACTION_PAGE = (65536, 131072), 512
+"""Bytes of ROBOTIS' action files: pages of 512"""
+_MCAP = b"\x89MCAP0\r\n"
 _PYTHON = re.compile(
     r"(?:\s*#.*\n)*\s*(from [\w.]+ import |import [\w.]+\s*(as \w+)?\s*$|def \w+\(|\"\"\")", re.MULTILINE
 )
 
 
 def _is_action(content: FileContent) -> bool:
-    """Recognize ROBOTIS' action file: all pages have their checksum, one byte that makes their sum 255."""
+    """Recognize ROBOTIS' action file: pages have their checksum, one byte that makes their sum 255.
+
+    Pages that were never written do not.
+    """
     data = content.data
     pages = [data[first : first + _ACTION_PAGE] for first in range(0, len(data), _ACTION_PAGE)]
-    return len(data) == _ACTION_BYTES and all(sum(page) & 0xFF == 0xFF for page in pages)
+    good = sum(sum(page) & 0xFF == 0xFF for page in pages)
+    return len(data) in _ACTION_BYTES and good > len(pages) / 2
+
+
+def _mcap_header(content: FileContent) -> tuple[str, bool] | None:
+    """Return the profile in the header of an MCAP file, and whether dxlrun wrote it; None for other files."""
+    data = content.data
+    if not data.startswith(_MCAP):
+        return None
+    size = int.from_bytes(data[len(_MCAP) + 9 : len(_MCAP) + 13], "little")
+    profile = data[len(_MCAP) + 13 :][:size]
+    library = data[len(_MCAP) + 17 + size :][:6]
+    return profile.decode(errors="replace"), library == b"dxlrun"
+
+
+def _is_modes(content: FileContent) -> bool:
+    groups = [content.values.get(key) for key in ("groups", "singles")]
+    entries = [one for group in groups if isinstance(group, dict) for one in group.values()]
+    keys = {"torque_enable", "operating_mode"}
+    return bool(entries) and all(isinstance(one, dict) and keys & one.keys() for one in entries)
+
+
+def _has_keys(*keys: str) -> Callable[[FileContent], bool]:
+    return lambda content: {*keys} <= content.values.keys()
 
 
 def _is_dataset(content: FileContent) -> bool:
@@ -99,8 +126,19 @@ def _has_ros_type(value: object, levels: int) -> bool:
 _LEROBOT = "a configuration of LeRobot"
 FIRST = (
     FileFormat(
-        "a recording in MCAP",
-        lambda content: content.data.startswith(b"\x89MCAP0\r\n"),
+        "a recording of ROS 2 in MCAP",
+        lambda content: _mcap_header(content) == ("ros2", False),
+        "`dxlrun convert {path} motion.yaml --controller NAME` converts its joint states to a motion file; "
+        "docs/how-to/replay.md",
+    ),
+    FileFormat(
+        "a recording of another program in MCAP",
+        lambda content: _mcap_header(content) not in (None, ("ros2", True)),
+        _EPISODE,
+    ),
+    FileFormat(
+        "a log of dxlrun",
+        lambda content: _mcap_header(content) is not None,
         "`dxlrun analyze {path}` evaluates a log of dxlrun, `dxlrun replay {path}` plays it, "
         "`dxlrun convert {path} motion.yaml` converts it to a motion file",
     ),
@@ -127,7 +165,7 @@ FIRST = (
         _EPISODE,
     ),
     FileFormat(
-        "an action file of ROBOTIS (OP2, OP3)",
+        "an action file of ROBOTIS (OP2, OP3, older Bioloid)",
         _is_action,
         _PAGES,
     ),
@@ -173,6 +211,26 @@ LAST = (
         "a parameter file of ROS 2 (ros2_control)",
         _is_ros2_parameters,
         f"{_DRAFT}; docs/how-to/from-ros2-control.md has its terms next to ours",
+    ),
+    FileFormat(
+        "a file of modes of an Interbotix arm",
+        _is_modes,
+        "give it with the arm's motor configuration: `dxlrun import ARM.yaml --modes {path}`",
+    ),
+    FileFormat(
+        "a list of controllers of MoveIt",
+        _has_keys("moveit_simple_controller_manager"),
+        "import the parameter file of ros2_control, or the URDF; docs/how-to/from-ros2-control.md",
+    ),
+    FileFormat(
+        "a pose of the ROBOTIS Framework (ini_pose)",
+        _has_keys("mov_time", "tar_pose"),
+        "import the `.robot` file, and write the angles as a pose of the robot file",
+    ),
+    FileFormat(
+        "a file of offsets of the ROBOTIS Framework",
+        lambda content: content.values.keys() in ({"offset"}, {"offset", "init_pose_for_offset_tuner"}),
+        "import the `.robot` file, and add the offsets to `reference` of its joints",
     ),
     FileFormat(
         "a calibration of LeRobot, of its first version",

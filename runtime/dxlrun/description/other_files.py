@@ -7,6 +7,7 @@ are loaded only after a file was refused, or when it is imported.
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache, cached_property
@@ -64,6 +65,9 @@ class FileContent:
     def document(self) -> PlainDocument:
         """Values of a YAML or JSON file with their places. Raises InputError if it is neither."""
         text = self.text.rstrip().removesuffix("\n---")  # `ros2 topic echo` ends each message so
+        # ROS 2 accepts more than one block for all nodes: the second one continues the first.
+        head, *blocks = re.split(r"^/\*\*:[ \t]*$", text, flags=re.MULTILINE)
+        text = head + "/**:" * bool(blocks) + "".join(blocks)
         return grow(parse(text, str(self.path)), str(self.path), literal)
 
     @cached_property
@@ -168,7 +172,11 @@ class FileFormat(NamedTuple):
         """Return what a file is, and the next step."""
         made = f"`dxlrun import {{path}} --output {self.makes}.yaml` converts it to a {self.makes} file"
         advice = self.advice or made
-        for key, value in (("path", str(path)), ("stem", path.stem), ("name", path.name)):
+        for key, value in (
+            ("path", str(path)),
+            ("stem", path.stem.removesuffix(".urdf")),
+            ("name", path.name),
+        ):
             advice = advice.replace(f"{{{key}}}", value)
         return f"this is {self.name}", advice
 
