@@ -105,10 +105,14 @@ class Points(dxlrun.CommandModel):
     start_in: float
 
 
+class Wait(dxlrun.CommandModel):
+    seconds: float
+
+
 class Whole(dxlrun.Controller[dxlrun.ParametersModel]):
     """Takes trajectories of all joints."""
 
-    Commands: ClassVar = {"trajectory": Points}
+    Commands: ClassVar = {"trajectory": Points, "wait": Wait}
 
     @classmethod
     def interfaces(cls, parameters, joints):
@@ -116,6 +120,8 @@ class Whole(dxlrun.Controller[dxlrun.ParametersModel]):
 
     @classmethod
     def prepare(cls, kind, command, parameters):
+        if kind == "wait":
+            return np.array([command.seconds])
         (point,) = command.points
         return np.array([command.start_in, point["time"], *point["positions"]])
 

@@ -343,7 +343,7 @@ class RemoteRobot:
             kind: Name of the command.
             command: Fields of the command, in SI units.
             units: Quantities are texts with units as in a motion file, such as `"30 deg"`.
-            seconds: Time in which a trajectory controller moves the named joints, s.
+            seconds: Duration of the motion, s: of named joints, or of a command with a field `seconds`.
             goal: Make the positions of a group controller a goal.
 
         Returns:

@@ -62,7 +62,7 @@ from dxlrun.remote.motion_requests import (
     goal_of,
     schedule_motion,
 )
-from dxlrun.remote.named.named_commands import INTERFACES, joint_command, source_command
+from dxlrun.remote.named.named_commands import INTERFACES, joint_command, source_command, timed_command
 from dxlrun.remote.named.named_joints import (
     effort_units,
     joint_row,
@@ -517,7 +517,8 @@ class GatewayApp:
             if found is not None:
                 kind, content, units, seconds = found.kind, found.content, False, None
         if seconds is not None:
-            raise invalid(texts.has_own_times(loaded.plan.name, kind))
+            known = self._preparation.parse_controller(loaded.plan)
+            content = timed_command(known, kind, content, seconds)
         prepared = self._preparation.command(loaded.plan, kind, content, units=units)
         prepared.require_within_limits()
         goal = None

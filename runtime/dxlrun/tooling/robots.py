@@ -1,4 +1,4 @@
-"""Robots: robot and motion files, read and compiled.
+"""Robots: robot and motion files and URDFs, read and compiled.
 
 Files are read into descriptions, which keep the place of each value for messages; a compiled robot has the
 plan. Each step raises `InputError` with all problems of the files.
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from dxlrun.control.controllers.plugin_loading import load_plugins as load_plugins
     from dxlrun.control.controllers.single_files import published_by as published_by
     from dxlrun.description.document import read_file as read_file
+    from dxlrun.description.frames.tree import FrameTree as FrameTree
     from dxlrun.description.including import Source as Source
     from dxlrun.description.including import read_sources as read_sources
     from dxlrun.description.joints.motor_file import motor_text as motor_text
@@ -37,6 +38,10 @@ if TYPE_CHECKING:
     from dxlrun.description.reading import Description as Description
     from dxlrun.description.reading import Replacement as Replacement
     from dxlrun.description.reading import read_robot as read_robot
+    from dxlsim.geometry.transform import from_rpy as from_rpy
+    from dxlsim.geometry.urdf import Urdf as Urdf
+    from dxlsim.geometry.urdf import UrdfJoint as UrdfJoint
+    from dxlsim.geometry.urdf import read_urdf as read_urdf
     from dxlwire.bus_plan import SIMULATED as SIMULATED
 else:
     __getattr__, __dir__ = lazy_face(__name__, __file__)

@@ -56,8 +56,8 @@ def send(
     file
         YAML file with the keys, in place of words on the command line.
     in_
-        Time in which joints by name reach their goals, such as 2s. Only for controllers that take
-        trajectories.
+        Duration of the motion, such as 2s: of joints by name with a controller that takes trajectories, and
+        of commands with a key `seconds`.
     wait
         Wait until the goal has ended, with a progress bar, and print the result. Ctrl-C cancels the goal.
         With --no-wait, return as soon as the controller has accepted the command.

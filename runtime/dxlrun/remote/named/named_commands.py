@@ -27,6 +27,8 @@ from dxlrun.remote.preparation import ResolvedController, invalid, plain_quantit
 
 POINT_SPEED = 0.5
 """Speed of a move of named joints without a duration, rad/s or m/s; slower joints use their highest speed."""
+DURATION = "seconds"
+"""Field of a command of any controller that has the duration of its motion, s."""
 _SHORTEST_S = 0.1
 _FIELDS = {"position": "positions", "velocity": "velocities", "effort": "efforts", "pwm": "pwm"}
 INTERFACES = {**{name: name for name in _FIELDS}, **{field: name for name, field in _FIELDS.items()}}
@@ -109,6 +111,23 @@ def joint_command(
         for each in fields_of
     }
     return JointCommand(chosen, msgspec.json.encode(content))
+
+
+def timed_command(known: ResolvedController, kind: str, body: bytes, seconds: float) -> bytes:
+    """Return a command as JSON with a duration, s, for the field `seconds` of the command.
+
+    Raises RefusedRequest when the command has no such field, or has a value for it already.
+    """
+    model = known.controller.Commands.get(kind)
+    if model is not None and DURATION in model.model_fields:
+        try:
+            given = msgspec.json.decode(body, type=dict[str, msgspec.Raw])
+        except (msgspec.MsgspecError, RecursionError):
+            # Refused later, as any other malformed command.
+            return body
+        if DURATION not in given:
+            return msgspec.json.encode({**given, DURATION: seconds})
+    raise invalid(texts.has_own_times(known.plan.name, kind))
 
 
 def _numbers(
