@@ -23,7 +23,7 @@ BARE = {
     "clear": "container",
 }
 DEFINITIONS = {
-    "prepare": 9,
+    "prepare": 10,
     "read": 7,
     "write": 5,
     **dict.fromkeys(("begin", "judge", "end", "get", "wait"), 2),
@@ -32,7 +32,7 @@ DEFINITIONS = {
 SHARED_METHODS = {
     **dict.fromkeys(("close", "fileno"), "protocol of Python"),
     **dict.fromkeys(("update", "interfaces", "on_activate", "on_configure", "on_command"), CONTRACT),
-    **dict.fromkeys(("on_parameters", "on_goal", "on_deactivate", "prepare"), CONTRACT),
+    **dict.fromkeys(("on_parameters", "on_goal", "on_cancel", "on_deactivate", "prepare"), CONTRACT),
     "read": "public contract of sensors, and of the servos of a script",
     "report": "protocol `ReportSink`",
     "mistakes": "hook of `ParametersModel`",

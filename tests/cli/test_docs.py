@@ -58,6 +58,7 @@ TESTS = {
     "recipes.md": ("tests/cli/test_recipes.py", "tests/robots/test_stand_up.py"),
     "replay.md": ("tests/analysis/replay/test_command_line.py",),
     "sensors.md": ("tests/sensors/test_page.py",),
+    "standard-controllers.md": ("tests/space/test_page.py",),
     "steering.md": ("tests/cli/test_steer.py",),
     "teleoperation.md": ("tests/teleop/test_page.py", "tests/teleop/test_terminal.py"),
     "network.md": ("tests/remote/test_network_run.py",),

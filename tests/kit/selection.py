@@ -51,6 +51,7 @@ TESTED = {
     "run": ("dxlrun.run", "dxlrun.channels", "dxlrun.control"),
     "sensors": ("dxlrun.features.sensors",),
     "simulation": ("dxlsim",),
+    "space": ("dxlrun_space",),
     "steering": ("dxlrun.control", "dxlrun.run", "dxlrun.dynamixel"),
     "teleop": ("dxlrun_teleop",),
     "view": ("dxlrun_view",),

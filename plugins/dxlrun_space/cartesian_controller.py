@@ -1,0 +1,468 @@
+"""cartesian_controller: move the tip of an arm to poses, or at twists, by inverse kinematics on the URDF."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from enum import Enum, auto, unique
+from typing import Annotated, ClassVar, Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from dxlrun import (
+    LINEAR,
+    Angle,
+    AngularAcceleration,
+    AngularVelocity,
+    CommandModel,
+    Context,
+    Controller,
+    Duration,
+    Goal,
+    InputError,
+    Interfaces,
+    LinearAcceleration,
+    LinearVelocity,
+    Mismatch,
+    Mistake,
+    Outcome,
+    ParametersModel,
+    RobotModel,
+)
+from dxlrun.tooling.robots import FrameTree, Urdf, read_urdf
+from dxlrun_space.chain import IDENTITY, Chain, Pose, Rotation, Vector, WrongChain, rotation_of
+from dxlrun_space.path import MotionLimits, NoPath, Path, Planning, Positions, plan_joints, plan_line
+from dxlrun_space.solver import Solver, residual_of
+from dxlrun_space.space_goals import (
+    PoseCommand,
+    PoseGoal,
+    TwistCommand,
+    flat_pose,
+    flat_twist,
+    in_axes,
+    read_pose,
+    read_twist,
+)
+from dxlrun_space.stream import TwistMotion
+
+ACCELERATION: Final = 20.0
+"""Acceleration of joints without a limit, rad/s^2; an XM430 stops from its highest speed in 0.25 s."""
+SPEED: Final = 4.0
+"""Speed of joints without a limit, rad/s: less than the slowest arm servo's at 12 V."""
+FULL: Final = 6
+"""Number of joints that can follow every orientation."""
+STEP_NS: Final = 750_000
+"""Period that pays for one step of planning: a step takes 0.06 ms, so planning takes 8 % of a cycle."""
+MOST_STEPS: Final = 50
+"""Most steps of a cycle, 3 ms."""
+FEEDBACK_NS: Final = 100_000_000
+"""Time between two feedback messages of a goal, ns."""
+_LONGEST_STOP_S: Final = 2.0
+_BASE: Final[Pose] = (IDENTITY, (0.0, 0.0, 0.0))
+_ZERO: Final[Vector] = (0.0, 0.0, 0.0)
+
+
+class TranslationLimits(ParametersModel):
+    """Limits of the tip's translation."""
+
+    velocity: Annotated[LinearVelocity, Field(gt=0)] = 0.2
+    """Highest speed of the tip, m/s."""
+    acceleration: Annotated[LinearAcceleration, Field(gt=0)] = 0.5
+    """Highest acceleration of the tip, m/s^2."""
+
+
+class RotationLimits(ParametersModel):
+    """Limits of the tip's rotation."""
+
+    velocity: Annotated[AngularVelocity, Field(gt=0)] = 1.5
+    """Highest angular velocity of the tip, rad/s."""
+    acceleration: Annotated[AngularAcceleration, Field(gt=0)] = 6.0
+    """Highest angular acceleration of the tip, rad/s^2."""
+
+
+class CartesianParameters(ParametersModel):
+    """Keys of a cartesian_controller in the robot file."""
+
+    joints: Annotated[tuple[str, ...], Field(min_length=1)]
+    """All joints that move the tip in the base."""
+    tip: str
+    """Link of the URDF that is moved."""
+    base: str = ""
+    """Link of the URDF in whose axes poses are; empty: the root."""
+    linear: TranslationLimits = TranslationLimits()
+    angular: RotationLimits = RotationLimits()
+    orientation: Literal["exact", "nearest"] | None = None
+    """`exact` refuses a pose whose orientation cannot be reached; `nearest` reaches the position first. By
+    default `exact` with six joints or more."""
+    posture: Mapping[str, Angle] = {}
+    """Positions by joint to which the arm tends where a pose leaves a choice. By default it turns little."""
+    timeout: Annotated[Duration, Field(gt=0)] = 200_000_000
+    """Validity of a twist. An older one is 0."""
+
+    def mistakes(self) -> Iterator[Mistake]:
+        """Yield each name in `posture` that is not a joint of the controller."""
+        yield from super().mistakes()
+        for name in self.posture:
+            if name not in self.joints:
+                known = ", ".join(self.joints)
+                yield ("posture", name), f"{name} is not one of its joints; they are {known}"
+
+
+@unique
+class _Phase(Enum):
+    RESTING = auto()
+    PLANNING = auto()
+    MOVING = auto()
+    STOPPING = auto()
+    """The tip brakes on its path, or from its twist; then a waiting goal begins."""
+    STREAMING = auto()
+
+
+class CartesianController(Controller[CartesianParameters]):
+    """Controller that moves a link to poses in space, one goal at a time, or at the twists of a stream.
+
+    A motion is planned as a whole before it begins, some steps in each cycle, so what is out of reach is
+    refused while the joints are still at rest. A new goal first brakes the old motion on its path. A twist
+    that leads to a limit of a joint, or to a singularity, becomes slower.
+    """
+
+    Parameters = CartesianParameters
+    Commands: ClassVar = {"pose": PoseCommand, "twist": TwistCommand}
+    Goals = frozenset({"pose"})
+
+    @classmethod
+    def interfaces(cls, parameters: CartesianParameters, joints: tuple[str, ...]) -> Interfaces:
+        """Command positions; read the positions of all other joints, for frames that these move."""
+        others = tuple(f"{joint}/position" for joint in joints if joint not in parameters.joints)
+        return Interfaces(parameters.joints, ("position",), reads=others)
+
+    @classmethod
+    def mismatches(cls, parameters: CartesianParameters, robot: RobotModel) -> Iterator[Mismatch]:
+        """Yield a missing URDF, or a chain that the URDF does not have."""
+        if robot.urdf is None:
+            yield Mismatch("needs a URDF, but the robot file names none", "write `model: {urdf: NAME.urdf}`")
+            return
+        try:
+            urdf = read_urdf(robot.urdf)
+            Chain(urdf, parameters.base, parameters.tip, parameters.joints)
+            for name, unit in zip(robot.joints, robot.units, strict=True):
+                joint = urdf.joint(name)
+                if joint is not None and (joint.type == "prismatic") != (unit is LINEAR):
+                    what = f"needs {name} to be the same in both files, but it is {joint.type} in the URDF"
+                    yield Mismatch(what, "correct its type in the URDF", name)
+        except WrongChain as wrong:
+            yield Mismatch(f"cannot move the tip: {wrong.what}", wrong.fix, wrong.key)
+        except InputError as error:
+            yield Mismatch(f"cannot use the URDF: {' '.join(str(error).split())}", "correct the URDF")
+
+    @classmethod
+    def prepare(
+        cls, kind: str, command: CommandModel, parameters: CartesianParameters
+    ) -> NDArray[np.float64]:
+        """Return a pose or a twist as one flat array."""
+        if isinstance(command, PoseCommand):
+            return flat_pose(command)
+        if isinstance(command, TwistCommand):
+            return flat_twist(command)
+        return super().prepare(kind, command, parameters)
+
+    def on_configure(self, context: Context) -> None:
+        """Build the chain, and everything that the loop needs."""
+        super().on_configure(context)
+        parameters, limits = self.parameters, context.limits
+        if context.urdf is None:
+            raise ValueError("no URDF; write `model: {urdf: NAME.urdf}`")
+        urdf = read_urdf(context.urdf)
+        self._chain = Chain(urdf, parameters.base, parameters.tip, context.joints)
+        self._frames = _frames(urdf, context)
+        lower, upper = limits.lower.tolist(), limits.upper.tolist()
+        self._limits = MotionLimits(
+            tuple(np.where(np.isnan(limits.velocity), SPEED, limits.velocity).tolist()),
+            tuple(np.where(np.isnan(limits.acceleration), ACCELERATION, limits.acceleration).tolist()),
+            parameters.linear.velocity,
+            parameters.linear.acceleration,
+            parameters.angular.velocity,
+            parameters.angular.acceleration,
+        )
+        posture = parameters.posture
+        self._solver = Solver(self._chain, lower, upper, [posture.get(joint) for joint in context.joints])
+        self._exact = parameters.orientation == "exact" or (
+            parameters.orientation is None and len(context.joints) >= FULL
+        )
+        self._stream = TwistMotion(self._chain, lower, upper, self._limits, exact=self._exact)
+        self._steps = min(MOST_STEPS, max(1, context.period_ns // STEP_NS))
+        self._at: Positions = ()
+        """Commanded positions, rad; empty while a joint has not answered yet."""
+        self._forget()
+
+    def _forget(self) -> None:
+        self._phase = _Phase.RESTING
+        self._goal: Goal | None = None
+        self._waiting: PoseGoal | None = None
+        self._ending: Outcome | None = None
+        """Outcome of the goal once the tip rests; None: another goal begins then."""
+        self._asked: PoseGoal | None = None
+        self._target: Pose = _BASE
+        self._planning: Planning | None = None
+        self._path: Path | None = None
+        self._passed_s = self._rate = self._slope = 0.0
+        self._stretch = 1.0
+        self._start_ns = self._feedback_ns = self._commanded_ns = 0
+        self._twist = _ZERO, _ZERO
+        self._turns_with_tip = False
+        self._said_held = False
+
+    def on_activate(self, time_ns: int) -> None:
+        """Hold the joints at their last goals."""
+        self._forget()
+        self._stream.drop_twist()
+        self._hold_joints()
+        self._write()
+
+    def on_deactivate(self, time_ns: int) -> None:
+        """Drop the goal, which the runtime has ended."""
+        self._goal = None
+
+    def _hold_joints(self) -> None:
+        """Hold the positions that were sent, or else the measured ones."""
+        goals, states = self.context.goals.position, self.context.states.position
+        held = np.where(np.isnan(goals), states, goals)
+        self._at = () if np.isnan(held).any() else tuple(held.tolist())
+
+    def _write(self) -> None:
+        if self._at:
+            self.context.commands.position[:] = self._at
+
+    # Goals
+
+    def on_goal(self, goal: Goal, data: NDArray[np.float64], time_ns: int) -> None:
+        """Plan a motion to the pose; a motion that is under way brakes first."""
+        self._goal, self._start_ns, self._feedback_ns = goal, time_ns, time_ns + FEEDBACK_NS
+        self._ending = None
+        if not self._at:
+            self._hold_joints()
+        if not self._at:
+            unknown = np.isnan(self.context.states.position)
+            joint = self.context.joints[int(unknown.argmax())]
+            self._end(Outcome.ABORTED, f"joint {joint} has not answered yet")
+            return
+        self._waiting = read_pose(data)
+        if self._phase in (_Phase.MOVING, _Phase.STREAMING):
+            self._brake()
+        elif self._phase is not _Phase.STOPPING:
+            self._plan()
+
+    def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
+        """Follow a twist; a pose that is under way ends as preempted."""
+        if not self._at:
+            self._hold_joints()
+        linear, angular, frame = read_twist(data)
+        self._turns_with_tip = frame == self._chain.tip
+        rotation: Rotation = IDENTITY
+        if not self._turns_with_tip:
+            found = self._pose_of(frame)
+            if isinstance(found, str):
+                self.context.warn(f"twist ignored: {found}")
+                return
+            rotation = found[0]
+        self._twist = in_axes(rotation, linear, angular)
+        self._commanded_ns = time_ns
+        if self._goal is not None:
+            self._end(Outcome.PREEMPTED, "replaced by a twist")
+        self._waiting = self._planning = None
+        if self._phase is _Phase.MOVING:
+            self._ending = None
+            self._brake()
+        elif self._phase is not _Phase.STOPPING:
+            self._phase = _Phase.STREAMING
+
+    def on_hold(self, time_ns: int) -> None:
+        """Brake from the twist: the stream has ended."""
+        self._twist = _ZERO, _ZERO
+        self._write()
+
+    def on_cancel(self, goal: Goal, time_ns: int) -> None:
+        """Brake on the path; the goal ends when the tip rests."""
+        self._waiting = self._planning = None
+        self._ending = Outcome.CANCELLED
+        if self._phase in (_Phase.MOVING, _Phase.STREAMING):
+            self._brake()
+        elif self._phase is not _Phase.STOPPING:
+            self._come_to_rest()
+
+    def _end(self, outcome: Outcome, text: str, joint: str = "") -> None:
+        goal, self._goal = self._goal, None
+        if goal is not None:
+            goal.end(outcome, text, joint)
+
+    def _plan(self) -> None:
+        """Begin to plan a motion from rest to the waiting goal."""
+        asked, self._waiting = self._waiting, None
+        self._phase = _Phase.RESTING
+        if asked is None:
+            return
+        frame = self._pose_of(asked.frame)
+        if isinstance(frame, str):
+            self._end(Outcome.ABORTED, frame)
+            return
+        self._asked, self._target = asked, asked.target(frame, self._chain.pose(self._at))
+        plan = plan_line if asked.by_line else plan_joints
+        exact = self._exact and asked.asks_orientation
+        self._planning = plan(self._solver, self._at, self._target, self._limits, exact=exact)
+        self._phase = _Phase.PLANNING
+
+    def _pose_of(self, frame: str) -> Pose | str:
+        """Return the pose of a frame in the base, or why it is not known."""
+        if not frame:
+            return _BASE
+        positions = dict(zip(self.context.joints, self._at, strict=False))
+        for name, value in zip(self.context.read_names, self.context.reads.tolist(), strict=True):
+            positions[name.removesuffix("/position")] = value
+        try:
+            pose = self._frames.pose(
+                frame,
+                self._chain.base,
+                {name: value for name, value in positions.items() if name in self._frames.moved},
+            )
+        except LookupError as error:
+            return str(error.args[0])
+        except ValueError:
+            return f"the pose of {frame} is not known; a joint has not answered yet"
+        return rotation_of(pose.rotation), pose.translation
+
+    # In a cycle
+
+    def update(self, time_ns: int, period_ns: int) -> None:
+        """Advance planning, path or twist by a period, and command the positions."""
+        if not self._at:
+            self._hold_joints()
+        elif self.context.states.has_lost and self._phase is not _Phase.RESTING:
+            self._abandon()
+        elif self._phase is _Phase.PLANNING:
+            self._advance_plan()
+        elif self._phase is _Phase.STREAMING or (self._phase is _Phase.STOPPING and self._path is None):
+            self._follow(time_ns, period_ns * 1e-9)
+        elif self._phase in (_Phase.MOVING, _Phase.STOPPING):
+            self._move(time_ns, period_ns * 1e-9)
+        self._write()
+
+    def _abandon(self) -> None:
+        """End everything where the joints were sent: a joint is lost, and the runtime holds the others."""
+        self._hold_joints()
+        self._stream.drop_twist()
+        text = ""
+        if self._asked is not None and self._at:
+            left = residual_of(self._chain.pose(self._at), self._target)
+            text = f"held {left.position * 1e3:.0f} mm before the pose"
+        self._end(Outcome.ABORTED, text)
+        self._forget()
+
+    def _advance_plan(self) -> None:
+        planning, goal, asked = self._planning, self._goal, self._asked
+        if planning is None or goal is None or asked is None:
+            self._phase = _Phase.RESTING
+            return
+        for _ in range(self._steps):
+            try:
+                next(planning)
+            except StopIteration as done:
+                self._begin(done.value, asked)
+                return
+
+    def _begin(self, found: Path | NoPath, asked: PoseGoal) -> None:
+        """Begin the motion that was planned, or end the goal with the reason why there is none."""
+        self._planning, self._phase = None, _Phase.RESTING
+        if isinstance(found, NoPath):
+            self._end(Outcome.ABORTED, found.text)
+            return
+        if asked.seconds < found.duration_s:
+            needed = math.ceil(found.duration_s * 100) / 100
+            self._end(
+                Outcome.ABORTED,
+                f"the motion takes {needed:.2f} s within its limits; ask for at least this time",
+            )
+            return
+        self._stretch = 1.0
+        if found.duration_s > 0 and not math.isnan(asked.seconds):
+            self._stretch = found.duration_s / asked.seconds
+        self._path, self._passed_s, self._rate, self._slope = found, 0.0, 1.0, 0.0
+        self._phase = _Phase.MOVING
+
+    def _move(self, time_ns: int, period_s: float) -> None:
+        """Advance on the path; its time passes more slowly while the tip brakes."""
+        path = self._path
+        if path is None:
+            self._come_to_rest()
+            return
+        before, self._rate = self._rate, max(0.0, self._rate - self._slope * period_s)
+        self._passed_s += (before + self._rate) / 2 * self._stretch * period_s
+        self._at = path.sample(self._passed_s).positions
+        if self._phase is _Phase.STOPPING:
+            if self._rate == 0.0 or self._passed_s >= path.duration_s:
+                self._come_to_rest()
+        elif self._passed_s >= path.duration_s:
+            self._arrive(path)
+        elif time_ns >= self._feedback_ns and self._goal is not None:
+            self._feedback_ns = time_ns + FEEDBACK_NS
+            error = float(np.abs(self.context.states.position - self._at).max())
+            self._goal.feedback(self._passed_s / path.duration_s, error)
+
+    def _arrive(self, path: Path) -> None:
+        """Let the runtime judge the goal by the joints at the end of the path."""
+        self._path, self._phase = None, _Phase.RESTING
+        goal, self._goal = self._goal, None
+        if goal is None:
+            return
+        text, left = "", path.residual
+        if self._asked is not None and self._asked.asks_orientation and not left.is_close:
+            text = (
+                f"{math.degrees(left.orientation):.1f} deg from the orientation, which the arm cannot reach"
+            )
+        goal.judge(np.array(path.last), text=text)
+
+    def _brake(self) -> None:
+        """Slow down on the path, as fast as the joints may brake, or from the twist."""
+        if self._phase is _Phase.MOVING and self._path is not None:
+            speeds = self._path.sample(self._passed_s).velocities
+            rates = [
+                most / max(abs(speed) * self._stretch, 1e-9)
+                for speed, most in zip(speeds, self._limits.acceleration, strict=True)
+            ]
+            # Half of the acceleration, because the path's own curvature needs the rest.
+            self._slope = max(min(rates) / 2, 1 / _LONGEST_STOP_S)
+        else:
+            self._path, self._twist = None, (_ZERO, _ZERO)
+        self._phase = _Phase.STOPPING
+
+    def _come_to_rest(self) -> None:
+        self._path, self._phase = None, _Phase.RESTING
+        if self._ending is not None:
+            outcome, self._ending = self._ending, None
+            self._end(outcome, "")
+        elif self._waiting is not None:
+            self._plan()
+        elif any(map(any, self._twist)):
+            self._phase = _Phase.STREAMING
+
+    def _follow(self, time_ns: int, period_s: float) -> None:
+        """Move at the twist, or brake from it."""
+        if time_ns - self._commanded_ns > self.parameters.timeout:
+            self._twist = _ZERO, _ZERO
+        linear, angular = self._twist
+        if self._turns_with_tip:
+            linear, angular = in_axes(self._chain.pose(self._at)[0], linear, angular)
+        self._at = self._stream.advance_joints(self._at, linear, angular, period_s)
+        held = self._stream.held_by
+        if held >= 0 and not self._said_held:
+            self.context.say(f"held: joint {self.context.joints[held]} is at its limit")
+        self._said_held = held >= 0
+        if self._stream.rests and not (any(linear) or any(angular)):
+            self._come_to_rest()
+
+
+def _frames(urdf: Urdf, context: Context) -> FrameTree:
+    """Return all frames of the robot, moved by its joints."""
+    others = (name.removesuffix("/position") for name in context.read_names)
+    return FrameTree(urdf, (*context.joints, *others))

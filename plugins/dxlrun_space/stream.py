@@ -1,0 +1,116 @@
+"""Stream: joint velocities for a twist of the tip, cycle by cycle, within all limits.
+
+Damped least squares (C. W. Wampler, "Manipulator inverse kinematic solutions based on vector formulations and
+damped least-squares methods", 1986): near a singularity joints become slower instead of faster.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Final
+
+from dxlrun_space.chain import Chain, Vector
+from dxlrun_space.path import MotionLimits
+from dxlrun_space.solver import EXACT, normal_matrix, solve
+
+_ORIENTATION: Final = 0.03
+"""Weight of the orientation for arms that cannot keep all its turns, as a fraction of the length, m/rad."""
+_DAMPING: Final = 0.01
+"""Damping, as a fraction of the length: 1 % of a joint's lever slows a motion by one part in ten thousand."""
+_STUCK: Final = 0.02
+"""Fraction of the velocity below which a motion counts as held."""
+
+
+class TwistMotion:
+    """Motion of a chain by twists.
+
+    Args:
+        chain: The chain.
+        lower: Lowest position of each joint.
+        upper: Highest position of each joint.
+        limits: Limits of joints and tip.
+        exact: The arm can keep the orientation, so it counts as much as the position.
+    """
+
+    def __init__(
+        self,
+        chain: Chain,
+        lower: Sequence[float],
+        upper: Sequence[float],
+        limits: MotionLimits,
+        *,
+        exact: bool,
+    ) -> None:
+        self._chain, self._limits = chain, limits
+        self._lower, self._upper = tuple(lower), tuple(upper)
+        self._weight = ((EXACT if exact else _ORIENTATION) * chain.length) ** 2
+        self._damping = (_DAMPING * chain.length) ** 2
+        self.linear: Vector = (0.0, 0.0, 0.0)
+        """Present velocity of the tip, m/s, within its acceleration limit."""
+        self.angular: Vector = (0.0, 0.0, 0.0)
+        self.held_by = -1
+        """Index of the joint that holds the tip at its limit, or -1."""
+
+    @property
+    def rests(self) -> bool:
+        """True if the tip is not moved."""
+        return not any(self.linear) and not any(self.angular)
+
+    def drop_twist(self) -> None:
+        """Set the velocity to 0 at once."""
+        self.linear = self.angular = (0.0, 0.0, 0.0)
+
+    def advance_joints(
+        self, positions: Sequence[float], linear: Vector, angular: Vector, period_s: float
+    ) -> tuple[float, ...]:
+        """Return the joint positions after a period at the twist, which the present velocity approaches."""
+        limits = self._limits
+        self.linear = _toward(
+            self.linear, _clamped(linear, limits.linear_velocity), limits.linear_acceleration * period_s
+        )
+        self.angular = _toward(
+            self.angular, _clamped(angular, limits.angular_velocity), limits.angular_acceleration * period_s
+        )
+        self.held_by = -1
+        if self.rests:
+            return tuple(positions)
+        self._chain.pose(positions)
+        columns = self._chain.jacobian()
+        (x, y, z), (u, v, w) = self.linear, self.angular
+        weight = self._weight
+        right = [a * x + b * y + c * z + weight * (d * u + e * v + f * w) for a, b, c, d, e, f in columns]
+        speeds = solve(normal_matrix(columns, weight, self._damping), right)
+        scale = 1.0
+        for index, (speed, now) in enumerate(zip(speeds, positions, strict=True)):
+            share = self._highest(index, now, speed, period_s) / max(abs(speed), 1e-12)
+            if share < scale:
+                scale = share
+                self.held_by = index if share < _STUCK else -1
+        return tuple(now + speed * scale * period_s for now, speed in zip(positions, speeds, strict=True))
+
+    def _highest(self, index: int, now: float, speed: float, period_s: float) -> float:
+        """Return the speed at which a joint still stops at its limit, at most its own limit."""
+        left = self._upper[index] - now if speed > 0 else now - self._lower[index]
+        if left <= 0:
+            return 0.0
+        brake = self._limits.acceleration[index] / 2
+        return min(self._limits.velocity[index], math.sqrt(2 * brake * left), left / period_s)
+
+
+def _clamped(vector: Vector, most: float) -> Vector:
+    length = math.hypot(*vector)
+    if length <= most:
+        return vector
+    x, y, z = vector
+    scale = most / length
+    return x * scale, y * scale, z * scale
+
+
+def _toward(now: Vector, goal: Vector, most: float) -> Vector:
+    (x, y, z), (u, v, w) = now, goal
+    length = math.hypot(u - x, v - y, w - z)
+    if length <= most:
+        return goal
+    scale = most / length
+    return x + (u - x) * scale, y + (v - y) * scale, z + (w - z) * scale

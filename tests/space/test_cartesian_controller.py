@@ -1,0 +1,287 @@
+"""cartesian_controller on a stage: poses, frames, twists, cancels, lost joints, and what is refused."""
+
+from __future__ import annotations
+
+import math
+import random
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+from tests.kit.judged_arms import apart, arms
+from tests.kit.stages import Stage
+
+from dxlrun.channels.cycle import Torque
+from dxlrun_space.cartesian_controller import CartesianController
+
+all_arms = cache(arms)
+ARM = ("joint1", "joint2", "joint3", "joint4")
+READY = (0.2, -0.6, 0.6, 0.5)
+SPEED = 4.0
+
+
+def staged(name: str = "open_manipulator_x", present: Any = READY, **keys: Any) -> Stage:
+    """Return an active controller of an arm, and the other joints at 0."""
+    arm = all_arms()[name]
+    limits = {"lower": arm.lower, "upper": arm.upper, "velocity": SPEED, "acceleration": 20.0}
+    parameters = {"joints": list(arm.joints), "tip": arm.tip, "base": arm.base, **keys}
+    stage = Stage(CartesianController, parameters, present, limits, urdf=arm.urdf, others=("gripper",))
+    stage.context.reads[:] = 0.0
+    return stage.activate()
+
+
+def played(stage: Stage, seconds: float) -> Any:
+    """Update for a time with servos that follow; return the commands, one row a cycle."""
+    rows = []
+    for _ in range(round(seconds / 0.02)):
+        rows.append(stage.update(stage.time_ns * 1e-9 + 0.02))
+    return np.array(rows)
+
+
+def assert_smooth(rows: Any) -> None:
+    assert np.abs(np.diff(rows, axis=0)).max() <= SPEED * 0.02 * 1.05
+    assert np.abs(np.diff(rows, 2, axis=0)).max() <= 20.0 * 0.02**2 * 1.05
+
+
+def tip(stage: Stage, name: str = "open_manipulator_x") -> Any:
+    return all_arms()[name].matrix(stage.commands.position)
+
+
+def test_a_pose_is_planned_at_rest_then_played_and_judged() -> None:
+    stage, begin = staged(), all_arms()["open_manipulator_x"].matrix(READY)
+    stage.send(0.0, "pose", dz="5 cm")
+    rows = played(stage, 3.0)
+    assert_smooth(rows)
+    assert rows[0] == pytest.approx(READY)
+    assert [outcome for outcome, *_ in stage.goal.ended] == ["reached"]
+    assert tip(stage)[:3, 3] == pytest.approx(begin[:3, 3] + [0, 0, 0.05], abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("pose", "expected"),
+    [
+        ({"x": 0.2, "y": 0.03, "z": 0.12}, [0.2, 0.03, 0.12]),
+        ({"z": "12 cm"}, [None, None, 0.12]),
+        ({"x": 0.18, "dy": -0.02}, [0.18, -0.02, None]),
+    ],
+)
+def test_coordinates_that_are_not_given_are_kept(pose: dict[str, Any], expected: list[Any]) -> None:
+    stage, begin = staged(), all_arms()["open_manipulator_x"].matrix(READY)[:3, 3]
+    stage.send(0.0, "pose", **pose)
+    played(stage, 5.0)
+    wanted = [now if goal is None else goal for goal, now in zip(expected, begin, strict=True)]
+    if "dy" in pose:
+        wanted[1] = begin[1] - 0.02
+    assert stage.goal.ended[0][0] == "reached", stage.goal.ended
+    assert tip(stage)[:3, 3] == pytest.approx(wanted, abs=1e-4)
+
+
+def test_distances_are_along_the_axes_of_a_frame_at_the_start() -> None:
+    for frame in ("end_effector_link", "link3", "left_finger"):
+        stage, begin = staged(), all_arms()["open_manipulator_x"].matrix(READY)
+        axes = (
+            begin if frame != "link3" else all_arms()["open_manipulator_x"].matrix((READY[0], READY[1], 0, 0))
+        )
+        stage.send(0.0, "pose", dx=-0.03, frame=frame)
+        played(stage, 4.0)
+        assert stage.goal.ended[0][0] == "reached", (frame, stage.goal.ended)
+        assert tip(stage)[:3, 3] == pytest.approx(begin[:3, 3] - 0.03 * axes[:3, 0], abs=1e-4), frame
+
+
+def test_an_arm_of_six_joints_turns_its_tip_as_asked() -> None:
+    present = (0.2, -0.4, 0.8, 0.3, 0.6, -0.2)
+    arm = all_arms()["six"]
+    for pose in ({"drpy": "0, 0, 20 deg"}, {"rpy": [0.1, 0.9, 0.3]}, {"quaternion": [0.0, 0.6, 0.0, 0.8]}):
+        stage = staged("six", present)
+        stage.send(0.0, "pose", **pose)
+        assert_smooth(played(stage, 4.0))
+        assert stage.goal.ended[0][0] == "reached", (pose, stage.goal.ended)
+        found, begin = tip(stage, "six"), arm.matrix(present)
+        assert found[:3, 3] == pytest.approx(begin[:3, 3], abs=1e-4)
+        if "quaternion" in pose:
+            assert found[:3, 0] == pytest.approx([1 - 2 * 0.36, 0.0, -2 * 0.6 * 0.8], abs=1e-3)
+        elif "drpy" in pose:
+            assert apart(found, begin)[1] == pytest.approx(math.radians(20), abs=1e-3)
+
+
+def test_an_orientation_that_the_arm_lacks_is_reported() -> None:
+    stage = staged()
+    stage.send(0.0, "pose", dz=0.02, rpy=(0.0, 0.3, 1.5))
+    played(stage, 5.0)
+    ((outcome, text, *_),) = stage.goal.ended
+    assert outcome == "reached"
+    assert "deg from the orientation, which the arm cannot reach" in text
+    exact = staged(orientation="exact")
+    exact.send(0.0, "pose", dz=0.02, rpy=(0.0, 0.3, 1.5))
+    rows = played(exact, 9.0)
+    assert exact.goal.ended[0][:2][0] == "aborted"
+    assert rows == pytest.approx(np.tile(READY, (len(rows), 1)))
+
+
+@pytest.mark.parametrize(
+    ("pose", "text"),
+    [
+        ({"x": 0.9}, "the pose is out of reach; the nearest is "),
+        ({"dz": 0.01, "frame": "hand"}, "frame hand not found; "),
+        ({"dz": 0.05, "seconds": 0.1}, "the motion takes 0.76 s within its limits; ask for"),
+    ],
+)
+def test_what_cannot_be_is_refused_before_a_joint_moves(pose: dict[str, Any], text: str) -> None:
+    stage = staged()
+    stage.send(0.0, "pose", **pose)
+    rows = played(stage, 9.0)
+    assert rows == pytest.approx(np.tile(READY, (len(rows), 1)), abs=1e-12)
+    assert (stage.goal.ended[0][0], stage.goal.ended[0][1][: len(text)]) == ("aborted", text)
+
+
+def test_a_duration_is_kept() -> None:
+    stage = staged()
+    stage.send(0.0, "pose", dz=0.05, seconds=3.0)
+    rows = played(stage, 5.0)
+    moving = np.flatnonzero(np.abs(np.diff(rows, axis=0)).max(axis=1) > 0)
+    assert (moving[-1] - moving[0]) * 0.02 == pytest.approx(3.0, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("command", "text"),
+    [
+        ({}, "give a coordinate or an orientation"),
+        ({"x": math.nan}, "finite"),
+        ({"quaternion": [0, 0, 0, 2]}, "has length 2; scale it"),
+        ({"rpy": [0, 90, 0]}, "90 rad is more than a turn"),
+        ({"rpy": [0, 0, 0], "drpy": [0, 0, 0]}, "give only one of rpy"),
+        ({"x": 0.1, "dx": 0.1}, "give either x or dx"),
+        ({"dz": "5"}, "has no unit"),
+        ({"rpy": "0, 5, 0"}, "has no unit"),
+        ({"dz": 0.1, "seconds": 0}, "greater than 0"),
+        ({"dz": 0.1, "path": "arc"}, "'line' or 'joints'"),
+    ],
+)
+def test_malformed_poses_are_refused(command: dict[str, Any], text: str) -> None:
+    with pytest.raises(ValidationError, match=text):
+        CartesianController.Commands["pose"].model_validate(command)
+
+
+def test_a_cancel_brakes_on_the_line() -> None:
+    stage, begin = staged(), all_arms()["open_manipulator_x"].matrix(READY)
+    stage.send(0.0, "pose", dz=0.1)
+    first = played(stage, 0.6)
+    stage.cancel()
+    rows = np.vstack([first, played(stage, 1.0)])
+    assert_smooth(rows)
+    assert stage.goal.ended[0][0] == "cancelled"
+    off = tip(stage)[:3, 3] - begin[:3, 3]
+    assert off[:2] == pytest.approx([0, 0], abs=1e-4)
+    assert 0.01 < off[2] < 0.09
+
+
+def test_a_new_goal_brakes_first_and_hostile_ones_do_no_harm() -> None:
+    stage, chance = staged(), random.Random(5)
+    stage.send(0.0, "pose", dz=0.1)
+    rows = [*played(stage, 0.6)]
+    for _ in range(100):
+        stage.send(None, "pose", **{name: chance.uniform(-0.5, 0.5) for name in ("dx", "y", "dz")})
+        rows += [*played(stage, 0.02)]
+    stage.send(None, "pose", dz=-0.02)
+    rows += [*played(stage, 4.0)]
+    assert_smooth(np.array(rows))
+    assert stage.goal.ended[0][0] == "reached"
+    assert {goal.ended[0][0] for goal in stage.goals[:-1]} == {"preempted"}
+
+
+def test_a_lost_joint_ends_the_goal_with_the_distance() -> None:
+    stage = staged()
+    stage.send(0.0, "pose", dz=0.1)
+    played(stage, 0.6)
+    held = stage.commands.position.copy()
+    stage.states.torque[1] = Torque.LOST
+    rows = played(stage, 0.2)
+    assert rows == pytest.approx(np.tile(held, (len(rows), 1)))
+    assert stage.goal.ended[0][0] == "aborted"
+    assert stage.goal.ended[0][1].startswith("joint joint2 does not answer; held ")
+    assert stage.goal.ended[0][1].endswith(" mm before the pose")
+
+
+def test_a_joint_that_has_not_answered_refuses_goals() -> None:
+    stage = staged()
+    stage.states.position[2] = stage.sent.position[2] = math.nan
+    stage.activate()
+    stage.send(0.0, "pose", dz=0.1)
+    assert stage.goal.ended[0][1] == "joint joint3 has not answered yet"
+    stage.context.reads[:] = math.nan
+    stage.states.position[2] = stage.sent.position[2] = 0.6
+    stage.send(0.1, "pose", dz=0.01, frame="left_finger")
+    assert "a joint has not answered yet" in stage.goal.ended[0][1]
+
+
+def streamed(stage: Stage, seconds: float, **twist: Any) -> Any:
+    rows = []
+    for _ in range(round(seconds / 0.02)):
+        stage.give("twist", **twist)
+        rows += [*played(stage, 0.02)]
+    return np.array(rows)
+
+
+def test_a_twist_moves_the_tip_and_ends_with_its_timeout() -> None:
+    stage, begin = staged(), all_arms()["open_manipulator_x"].matrix(READY)
+    rows = streamed(stage, 1.0, vz=0.05)
+    at = tip(stage)[:3, 3] - begin[:3, 3]
+    assert at == pytest.approx([0, 0, 0.0475], abs=2e-3)
+    rows = np.vstack([rows, played(stage, 1.0)])
+    assert_smooth(rows)
+    assert np.abs(rows[-1] - rows[-10]).max() == 0.0
+    off = tip(stage)[:3, 3] - begin[:3, 3]
+    assert off[2] < 0.0475 + 0.05 * 0.2 + 0.005
+
+
+def test_a_twist_in_the_axes_of_the_tip_turns_with_it() -> None:
+    stage = staged("six", (0.2, -0.4, 0.8, 0.3, 0.6, -0.2))
+    begin = tip(stage, "six") if not np.isnan(stage.commands.position).any() else None
+    rows = streamed(stage, 1.0, wx=0.5, frame="tip")
+    assert_smooth(rows)
+    found = tip(stage, "six")
+    assert begin is not None
+    assert found[:3, 3] == pytest.approx(begin[:3, 3], abs=2e-3)
+    assert found[:3, 0] == pytest.approx(begin[:3, 0], abs=0.02)
+    assert apart(found, begin)[1] == pytest.approx(0.48, abs=0.05)
+
+
+@pytest.mark.parametrize("name", ["open_manipulator_x", "six"])
+def test_twists_into_singularities_and_limits_are_held(name: str) -> None:
+    """Out to the stretched arm, and on: within all limits, without a leap, and back again."""
+    present = READY if name == "open_manipulator_x" else (0.2, -0.4, 0.8, 0.3, 0.6, -0.2)
+    arm, stage = all_arms()[name], staged(name, present)
+    rows = np.vstack(
+        [streamed(stage, 4.0, vx=0.2), streamed(stage, 2.0, vx=-0.2), streamed(stage, 4.0, vz=-0.2)]
+    )
+    assert np.abs(np.diff(rows, axis=0)).max() <= SPEED * 0.02 * 1.01
+    assert all(arm.within(row) for row in rows)
+    assert np.abs(rows[-1] - rows[-2]).max() < 0.02
+
+
+def test_a_pose_follows_a_twist_and_a_twist_ends_a_pose() -> None:
+    stage = staged()
+    rows = [*streamed(stage, 0.5, vz=0.1)]
+    stage.send(None, "pose", dz=-0.02)
+    rows += [*played(stage, 0.5)]
+    rows += [*streamed(stage, 0.5, vx=0.05)]
+    assert stage.goal.ended[0][:2] == ("preempted", "replaced by a twist")
+    rows += [*played(stage, 1.0)]
+    assert_smooth(np.array(rows))
+
+
+def test_the_joint_that_holds_a_twist_is_reported_once() -> None:
+    stage = staged(present=(0.2, -0.6, 0.6, 2.03))
+    streamed(stage, 2.0, wy=1.0)
+    assert len([text for text in stage.said if text.startswith("held: joint ")]) <= 2
+    assert stage.said[0].startswith("held: joint joint")
+
+
+def test_no_module_of_linear_algebra_is_needed() -> None:
+    """A replay elsewhere is exact because no library that depends on the processor decides."""
+    for name in ("chain", "solver", "path", "stream"):
+        text = Path(__file__).parents[2].joinpath("plugins", "dxlrun_space", f"{name}.py").read_text()
+        assert "import numpy" not in text

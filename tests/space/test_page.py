@@ -1,0 +1,40 @@
+"""The commands of standard-controllers.md move an arm that runs, on virtual time."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+from pathlib import Path
+
+import pytest
+from tests.kit.commands import Dxlrun
+from tests.kit.judged_arms import arms
+from tests.kit.pages import page_commands
+
+from dxlrun import RemoteRobot
+from dxlrun.cli.steering import goals
+from dxlrun.testing import plan_of
+from dxlrun.tooling.runs import VirtualLink
+
+ROBOTS = Path(__file__).parents[2] / "robots"
+
+
+def test_commands_of_the_page(dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch) -> None:
+    link = VirtualLink(plan_of(ROBOTS / "open_manipulator_x_space.yaml"))
+    robot, arm = RemoteRobot("arm", link), arms()["open_manipulator_x"]
+    monkeypatch.setattr(goals, "connect_robot", lambda *_: nullcontext(robot))
+    robot.send("arm", "pose", {"x": 0.15, "y": 0.0, "z": 0.2, "path": "joints"})
+    for _ in range(400):
+        link.run_cycle()
+    tips = []
+    commands = [words for words in page_commands("standard-controllers.md") if "pose" in words]
+    assert len(commands) == 2
+    for words in commands:
+        said = dxlrun(*words)
+        assert (said.code, said.err) == (0, "")
+        for _ in range(300):
+            link.run_cycle()
+        measured = dict(zip(robot.states().joints, robot.states().position.tolist(), strict=True))
+        tips.append(arm.matrix([measured[joint] for joint in arm.joints])[:3, 3])
+    assert tips[0] == pytest.approx([0.2, 0.0, 0.15], abs=1e-3)  # within the ticks of servos
+    assert tips[1] - tips[0] == pytest.approx([0.0, 0.0, 0.05], abs=1e-3)
+    assert {state.status for state in robot.goals()} == {"reached"}

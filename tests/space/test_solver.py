@@ -1,0 +1,124 @@
+"""Poses are solved within limits, judged by matrices of our own and by pinocchio; distances are true."""
+
+from __future__ import annotations
+
+import math
+import random
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from tests.kit.campaigns import campaign
+from tests.kit.judged_arms import Arm, apart, arms, as_pose, six_axis
+
+from dxlrun_space.solver import Solver
+
+NAMES = ("open_manipulator_x", "koch", "op3", "poppy_ergo_jr", "six", "seven")
+MOST_STEPS = 25 * 120  # of each of all starts
+all_arms = cache(arms)
+
+
+def found_by(search: Any) -> Any:
+    """Return what a search finds, and count its steps."""
+    for _ in range(MOST_STEPS):
+        try:
+            next(search)
+        except StopIteration as done:
+            return done.value
+    raise AssertionError("the search has no end")
+
+
+@pytest.mark.parametrize("name", NAMES)
+@campaign(ci=1, night=20, release=400)
+def test_reachable_poses_are_solved(name: str, number: int, chance: random.Random) -> None:
+    arm = all_arms()[name]
+    for _ in range(25):
+        goal, start = arm.drawn(chance), arm.drawn(chance)
+        solution = found_by(arm.solver.search(arm.target(goal), start, exact=arm.exact))
+        assert arm.within(solution.positions)
+        far, off = apart(arm.matrix(solution.positions), arm.matrix(goal))
+        assert far < 1e-4, (goal, start)
+        assert off < math.radians(0.1), (goal, start)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@campaign(ci=4, night=100, release=1000)
+def test_unreachable_poses_have_a_true_distance(name: str, amount: int, chance: random.Random) -> None:
+    """No position of thousands is nearer than what was found."""
+    arm, dice = all_arms()[name], np.random.default_rng(chance.randrange(1 << 30))
+    draws = dice.uniform(arm.lower, arm.upper, (2000, len(arm.joints)))
+    tips = np.array([arm.chain.pose(row)[1] for row in draws.tolist()])
+    for _ in range(amount):
+        goal = arm.matrix(arm.drawn(chance))
+        way = dice.normal(size=3)
+        goal[:3, 3] = goal[:3, 3] + way / np.linalg.norm(way) * arm.chain.length * 2
+        solution = found_by(arm.solver.search(as_pose(goal), arm.drawn(chance), exact=False))
+        far, _ = apart(arm.matrix(solution.positions), goal)
+        assert solution.residual.position == pytest.approx(far, abs=1e-9)
+        assert far <= np.linalg.norm(tips - goal[:3, 3], axis=1).min() + 1e-4
+        assert arm.within(solution.positions)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_chain_has_the_poses_and_the_jacobian_of_the_urdf(name: str) -> None:
+    arm, chance = all_arms()[name], random.Random(1)
+    for _ in range(20):
+        at = arm.drawn(chance)
+        rotation, place = arm.chain.pose(at)
+        columns, here = arm.chain.jacobian(), arm.matrix(at)
+        assert rotation == pytest.approx(here[:3, :3].T.ravel(), abs=1e-12)
+        assert place == pytest.approx(here[:3, 3], abs=1e-12)
+        for joint, column in enumerate(columns):
+            moved = [each + 1e-6 * (row == joint) for row, each in enumerate(at)]
+            slope = (arm.matrix(moved) - here) / 1e-6
+            spin = slope[:3, :3] @ here[:3, :3].T
+            assert column[:3] == pytest.approx(slope[:3, 3], abs=1e-5)
+            assert column[3:] == pytest.approx([spin[2, 1], spin[0, 2], spin[1, 0]], abs=1e-5)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_pinocchio_agrees(name: str) -> None:
+    pin = pytest.importorskip("pinocchio", reason="pin has 380 MB, so only the extra `full` has it")
+    arm, chance = all_arms()[name], random.Random(2)
+    model = pin.buildModelFromXML(arm.urdf)
+    data, places = model.createData(), [model.joints[model.getJointId(one)].idx_q for one in arm.joints]
+    for _ in range(20):
+        at = arm.drawn(chance)
+        whole = pin.neutral(model)
+        whole[places] = at
+        pin.framesForwardKinematics(model, data, whole)
+        base, tip = (data.oMf[model.getFrameId(link)] for link in (arm.base, arm.tip))
+        assert (base.inverse() * tip).homogeneous == pytest.approx(arm.matrix(at), abs=1e-12)
+
+
+def test_an_arm_with_seven_joints_tends_to_its_posture() -> None:
+    arm, chance = six_axis(more=True), random.Random(3)
+    wanted = [0.0] * 7
+    tending = Solver(arm.chain, arm.lower, arm.upper, wanted)
+    nearer = 0
+    for _ in range(20):
+        goal = arm.drawn(chance, 0.5)
+        start = [each + chance.uniform(-0.3, 0.3) for each in goal]
+        free, drawn = (
+            found_by(solver.search(arm.target(goal), start, exact=True)) for solver in (arm.solver, tending)
+        )
+        assert drawn.residual.is_close
+        nearer += math.hypot(*drawn.positions) < math.hypot(*free.positions) + 1e-9
+    assert nearer >= 19
+
+
+def test_a_search_is_the_same_each_time() -> None:
+    arm = all_arms()["koch"]
+    target, start = arm.target((1.0, -0.5, 0.7, 0.2, 0.4)), (0.0,) * 5
+    once, again = (found_by(arm.solver.search(target, start, exact=True)) for _ in range(2))
+    assert once == again
+
+
+def test_position_comes_first_where_the_orientation_cannot_be_reached() -> None:
+    arm: Arm = all_arms()["op3"]
+    goal = arm.matrix((0.3, 0.2, 0.9))
+    goal[:3, :3] = goal[:3, :3] @ np.diag([-1.0, -1.0, 1.0])
+    solution = found_by(arm.solver.search(as_pose(goal), (0.0, 0.0, 0.0), exact=False))
+    assert solution.residual.position < 1e-4
+    assert solution.residual.orientation > 0.1
