@@ -211,9 +211,11 @@ def _holder(path: str, describe: DescribeProcess) -> str:
     The first non-empty description is used. Without one, each process is named by its command. Processes
     of other users may be invisible."""
     device = os.path.realpath(path)
-    found = [
-        process for process in _processes() if process.name != str(os.getpid()) and _has_open(process, device)
-    ]
+    found = [process for process in _processes() if _has_open(process, device)]
+    own = str(os.getpid())
+    if [process.name for process in found] == [own]:
+        return "this program itself; close the other one first"
+    found = [process for process in found if process.name != own]
     if described := next(filter(None, map(describe, found)), ""):
         return described
     named = [f"{_command(process)} (process {process.name})" for process in found]
