@@ -99,10 +99,14 @@ class ServoError(DxlError):
     the others did it."""
 
     def __init__(self, port: str, failures: Mapping[int, ServoFailure]) -> None:
+        self.port = port
         self.failures = dict(failures)
         super().__init__(
             "\n".join(f"ID {servo_id} on {port} {one.text}" for servo_id, one in self.failures.items())
         )
+
+    def __reduce__(self) -> tuple[type[ServoError], tuple[str, dict[int, ServoFailure]]]:
+        return type(self), (self.port, self.failures)  # For pools of processes
 
 
 _WORD = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|[0-9]+")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import copy
+import pickle
 import re
 import threading
 from pathlib import Path
@@ -124,8 +126,9 @@ def test_eeprom_is_written_only_where_it_differs_and_without_torque(script):
 @pytest.mark.parametrize(
     ("item", "value", "words"),
     [
-        ("goal_position", 7.0, r"Goal Position \(116\) of XM430-W350: 7 rad is outside 0 to 6.28"),
-        ("goal_position", -0.1, "-0.1 rad is outside"),
+        ("goal_velocity", 25.0, r"Goal Velocity \(104\) of XM430-W350: 25 rad/s is outside -24.5"),
+        ("goal_pwm", -1.1, "-1.1 is outside -1 to 1"),
+        ("id", 9, "two servos of one line cannot have the same ID"),
         ("goal_position", float("nan"), "nan rad is outside"),
         ("goal_position", [1.0, 2.0], "2 values for 3 servos"),
         ("operating_mode", "wheel", "'wheel' is not a value"),
@@ -199,9 +202,9 @@ def test_writer_sends_each_goal_in_each_call_within_the_range_of_the_item(script
     sent = script.sent()
     assert sent == [sent[0]] * 5
     assert (sent[0][7], sent[0][8], sent[0][10]) == (SYNC_WRITE, 112, 8)  # the two items are one block
-    write([9.0, -1.0, np.inf], 1.0)
+    write([3.0, 2.0, 1.0], [9e3, -1.0, np.inf])
     (packet,) = script.sent()
-    assert [int.from_bytes(packet[at : at + 4], "little") for at in (17, 26, 35)] == [4095, 0, 4095]
+    assert [int.from_bytes(packet[at : at + 4], "little") for at in (13, 22, 31)] == [32767, 0, 32767]
     with pytest.raises(TypeError, match="takes 2 values"):
         write(1.0)
     with pytest.raises(ValueError, match="broadcast"):
@@ -210,9 +213,75 @@ def test_writer_sends_each_goal_in_each_call_within_the_range_of_the_item(script
         ("operating_mode", "in the EEPROM"),
         ("present_load", "no item"),
         ("moving", "read-only"),
+        ("torque_enable", "use `servos.torque = True`"),
     ):
         with pytest.raises((ValueError, LookupError), match=words):
             servos.writer(item)
+
+
+@pytest.mark.parametrize(
+    "items", [("goal_position", "profile_velocity"), ("profile_velocity", "goal_position")]
+)
+def test_servo_with_a_value_of_nan_gets_nothing(script, items):
+    write = script.bus.scan().writer(*items)
+    script.sent()
+    write([np.nan, 3.0, 3.0], [2.0, 2.0, np.nan])  # a goal of NaN would be the end of the range
+    (packet,) = script.sent()
+    assert (packet[12], len(packet)) == (2, 12 + 9 + 2)
+
+
+def test_goals_of_many_turns_are_sent_as_they_are(script):
+    servos = script.bus.servos({1: "XM430-W350"})
+    servos.write("operating_mode", "extended_position")
+    servos.writer("goal_position")(20.0)
+    assert servos.read("goal_position") == pytest.approx(20.0, abs=0.002)
+    servos.write("goal_position", -20.0)
+    assert servos.read("goal_position") == pytest.approx(-20.0, abs=0.002)
+    old = Script("MX-28:1", protocol=1.0)
+    servos = old.bus.scan([1])
+    servos.write("cw_angle_limit", 4095, raw=True)
+    servos.write("ccw_angle_limit", 4095, raw=True)
+    servos.torque = True
+    write, read = servos.writer("goal_position"), servos.reader("present_position", "goal_position")
+    for _ in range(60):
+        write(-7.0)
+        old.let_pass(0.05)
+    assert [*read().position, *read().goal_position] == pytest.approx([-7.0, -7.0], abs=0.01)
+
+
+def test_torque_has_one_value_for_each_servo(script):
+    servos = script.bus.scan()
+    servos.torque = [True, False, True]
+    before = servos.torque
+    assert before.tolist() == [True, False, True]
+    servos.torque = ~before
+    assert servos.torque.tolist() == [False, True, False]
+    for wrong in ("off", 2, [1, 0, 1]):
+        with pytest.raises(ValueError, match="use True or False"):
+            servos.torque = wrong
+    with pytest.raises(ValueError, match="2 values for 3 servos"):
+        servos.torque = [True, False]
+    with pytest.raises(AttributeError):
+        servos.torqe = False
+
+
+def test_set_of_servos_is_a_mapping_of_ids_and_takes_numbers_of_numpy(script):
+    servos = script.bus.scan()
+    assert [servos[each].ids for each in servos] == [(1,), (2,), (3,)]
+    assert (2 in servos, 7 in servos, servos[np.int64(3)].ids) == (True, False, (3,))
+    servos.write("led", np.int64(1))
+    servos.write("led", np.array(0))
+    with pytest.raises(ValueError, match="led is named twice"):
+        servos.reader("led", "led")
+
+
+def test_states_are_copied_and_errors_pickled(script):
+    state = copy.deepcopy(script.bus.scan().reader("present_position")())
+    assert (state.position.shape, state.valid.all()) == ((3,), True)
+    with pytest.raises(ServoError) as caught:
+        script.bus.servos({9: "XM430-W350"})
+    copied = pickle.loads(pickle.dumps(caught.value))  # noqa: S301  as pools of processes do
+    assert (str(copied), copied.failures) == (str(caught.value), caught.value.failures)
 
 
 def test_lost_servo_is_invalid_while_the_others_are_read(script):
@@ -262,6 +331,54 @@ def test_torque_stays_unless_the_bus_is_told(script):
     with Bus.on_session(script.session, limp_at_exit=True) as bus:
         bus.scan().torque = True
     assert not any(servo.torque_on for servo in script.simulated.servos)
+
+
+def test_all_others_are_limp_at_exit_when_one_is_silent(script):
+    bus = Bus.on_session(script.session, limp_at_exit=True)
+    for servo_id in (1, 2, 3):
+        bus.servos({servo_id: "XM430-W350"}).torque = True
+    script.simulated.servos[0].silence()
+    with pytest.raises(ServoError, match="ID 1 on line did not answer the write of Torque Enable"):
+        bus.close()
+    assert [servo.torque_on for servo in script.simulated.servos] == [True, False, False]
+    bus.close()
+
+
+@pytest.mark.parametrize("call", ["reader", "read"])
+def test_servos_are_limp_after_ctrl_c_in_the_middle_of_a_reply(call):
+    pressed = []
+
+    def beat():  # called while replies are awaited
+        if pressed:
+            pressed.clear()
+            raise KeyboardInterrupt
+
+    with serve_bus("XM430-W350:1-3") as served:
+        opened = session.open_session(served.path, served.baud_rate, 2.0)
+        opened.lines.beat = beat
+        with pytest.raises(KeyboardInterrupt), Bus.on_session(opened, limp_at_exit=True) as bus:  # noqa: PT012
+            servos = bus.servos(dict.fromkeys((1, 2, 3), "XM430-W350"))
+            servos.torque = True
+            read = servos.reader("present_position", "present_velocity")
+            for _ in range(4):
+                assert read().valid.all()
+            pressed.append(True)
+            if call == "reader":
+                read()
+            servos.read("led")
+        assert not any(servo.torque for servo in served.snapshot_servos())
+    sent = [entry.data for entry in served.ledger.entries if entry.direction == "in"]
+    assert [one for one in written(sent, 64) if one[1] == 0] == [(1, 0), (2, 0), (3, 0)]  # none collided
+
+
+def test_torque_off_is_sent_again_when_the_servo_has_not_executed_it(script):
+    servos = script.bus.scan([2])
+    servos.torque = True
+    for _ in range(2):
+        script.simulated.alter_next_instruction("lost", lambda packet: b"")
+        script.simulated.alter_next_instruction("kept", bytes)
+    servos.torque = False
+    assert not script.simulated.servos[1].torque_on
 
 
 def test_record_keeps_every_packet(script, tmp_path):
@@ -322,7 +439,7 @@ def test_threads_share_a_bus_and_the_event_loop_waits_for_real_lines():
             for thread in threads:
                 thread.join()
             assert valid == [True] * 8
-            with pytest.raises(PortError, match="is in use"):
+            with pytest.raises(PortError, match="is in use by this program itself; close the other one"):
                 Bus(served.path)
 
         async def work():
@@ -350,12 +467,14 @@ def test_without_the_kernel_the_sdk_does_the_same(monkeypatch, servos, protocol)
             found.torque = True
             read, write = found.reader("present_position", "goal_position"), found.writer("goal_position")
             before = read()
-            write(before.position + np.array([0.1, np.nan, -100.0]))
+            write(before.position + np.array([0.1, np.nan, -3000.0]))
             state = read()
             assert state.valid.all()
-            assert state.goal_position == pytest.approx(
-                [before.position[0] + 0.1, before.position[1], 0], abs=0.01
+            # The last goal is below the range of the item: -256 turns in extended position control
+            assert state.goal_position[:2] == pytest.approx(
+                before.position[:2] + np.array([0.1, 0]), abs=0.01
             )
+            assert state.goal_position[2] == pytest.approx(0 if protocol == 1.0 else before.position[2])
             served.inject("silence servo=2")
             state = read()
             assert state.valid.tolist() == [True, False, True]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -16,7 +16,7 @@ from dxlwire.bus.blocking_bus import RATE
 from dxlwire.bus.kernel_exchange import Reading
 from dxlwire.bus.programs import find_ids, identify
 from dxlwire.bus.sdk_exchange import SdkReading
-from dxlwire.bus.servo_group import ServoGroup, Values, found_group, named_servos
+from dxlwire.bus.servo_group import ServoGroup, Switch, Values, found_group, named_servos
 from dxlwire.bus.servo_rows import ServoStates, WrittenRows
 from dxlwire.bus.session import SdkSession, Session, open_session
 from dxlwire.exchange.arrays import Floats
@@ -184,7 +184,13 @@ class AsyncServoSet:
         return self._group.models
 
     def __getitem__(self, ids: int | Sequence[int]) -> AsyncServoSet:
-        return AsyncServoSet(self._waiting, self._group.part([ids] if isinstance(ids, int) else ids))
+        return AsyncServoSet(self._waiting, self._group.part(ids))
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self.ids)
+
+    def __len__(self) -> int:
+        return len(self.ids)
 
     async def read(self, item: str, *, raw: bool = False) -> Floats:
         """Read an item of every servo once, see `ServoSet.read`."""
@@ -202,7 +208,7 @@ class AsyncServoSet:
         """Return True for each servo that has torque."""
         return (await self.read("torque_enable")).astype(np.bool_)
 
-    async def switch_torque(self, on: bool) -> None:
+    async def switch_torque(self, on: Switch) -> None:
         """Switch torque on or off; before it is switched on, goals become the present positions."""
         self._group.raise_failures(await self._waiting.run_program(self._group.switch_all(on)))
 

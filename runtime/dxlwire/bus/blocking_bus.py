@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dxlwire.bus.programs import Addressed, Failures, find_ids, identify
-from dxlwire.bus.servo_group import ServoGroup, Values, found_group, named_servos
+from dxlwire.bus.servo_group import ServoGroup, Switch, Values, found_group, named_servos
 from dxlwire.bus.servo_rows import ReadRows, ServoStates, WrittenRows
 from dxlwire.bus.session import OpenLine, Session, open_session
+from dxlwire.exceptions import ServoError
 from dxlwire.exchange.arrays import Floats
 
 RATE = 57_600  # Factory setting of most servos, bit/s
@@ -62,11 +63,15 @@ class Bus:
         Raises:
             ServoError: A servo did not confirm that its torque is off.
         """
+        groups, self._groups = self._groups, []
+        failures: Failures = {}
         try:
-            for group in self._groups if self._limp_at_exit else ():
-                group.raise_failures(self._session.run_program(group.switch_all(False)))
+            for group in groups if self._limp_at_exit else ():
+                failures |= self._session.run_program(group.switch_all(False))
         finally:
             self._session.close()
+        if failures:
+            raise ServoError(self._session.name, failures)
 
     def record(self, path: str | os.PathLike[str]) -> None:
         """Record all packets from now on in a new log, which `dxlrun analyze` reads.
@@ -106,7 +111,11 @@ class Bus:
 
 
 class ServoSet:
-    """Servos of one bus. Values are arrays with one element for each servo, in the order of `ids`."""
+    """Servos of one bus. Values are arrays with one element for each servo, in the order of `ids`.
+
+    `servos[1]` and `servos[[1, 2]]` are sets of some of them; iteration yields the IDs."""
+
+    __slots__ = ("_group", "_session")  # A misspelled `torque` must not become a new attribute
 
     def __init__(self, group: ServoGroup) -> None:
         self._group = group
@@ -126,7 +135,10 @@ class ServoSet:
         return len(self.ids)
 
     def __getitem__(self, ids: int | Sequence[int]) -> ServoSet:
-        return ServoSet(self._group.part([ids] if isinstance(ids, int) else ids))
+        return ServoSet(self._group.part(ids))
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self.ids)
 
     def __repr__(self) -> str:
         return f"ServoSet({dict(zip(self.ids, self.models, strict=True))})"
@@ -166,12 +178,13 @@ class ServoSet:
     def torque(self) -> NDArray[np.bool_]:
         """True for each servo that has torque; read from the servos. Set it to switch torque.
 
-        Before torque is switched on, the goal of each servo becomes its present position."""
+        The value is one for all servos, or one for each. Before torque is switched on, the goal of each
+        servo becomes its present position."""
         return self.read("torque_enable").astype(np.bool_)
 
     @torque.setter
-    def torque(self, on: bool) -> None:
-        self._group.raise_failures(self._session.run_program(self._group.switch_all(bool(on))))
+    def torque(self, on: Switch) -> None:
+        self._group.raise_failures(self._session.run_program(self._group.switch_all(on)))
 
     def reader(self, *items: str, raw: bool = False) -> ServoReader:
         """Prepare to read items again and again, by the fastest instruction that all servos have.

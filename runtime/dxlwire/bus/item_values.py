@@ -3,24 +3,39 @@ wire."""
 
 from __future__ import annotations
 
+from msgspec.structs import replace
+
 from dxlwire.control_table import ControlItem, ControlTable
 from dxlwire.control_table.control_items import SIGN_BIT
 from dxlwire.exceptions import suggestion
-from dxlwire.plan.mode_plan import mode_numbers
+from dxlwire.plan.mode_plan import mode_numbers, position_reach
 
 MODE_ITEMS = ("operating_mode", "control_mode")
 """Items whose values have names: `position`, `wheel`."""
 
 
+_POSITIONS = ("goal_position", "present_position")
+
+
 def item_of(table: ControlTable, name: str) -> ControlItem:
     """Return an item by its name in the control table.
+
+    The range of the goal position is that of all modes: in extended position control and multi-turn mode it
+    is many turns, and a goal that is limited to one turn would turn the servo back. In the other modes the
+    servo refuses a goal beyond its limits.
 
     Raises:
         LookupError: The model has no such item.
     """
     if name not in table.items:
         raise LookupError(f"{table.model} has no item {name!r}; {suggestion(name, table.items)}")
-    return table.items[name]
+    item = table.items[name]
+    if name not in _POSITIONS:
+        return item
+    if "multi_turn_offset" in table.items:  # Negative turns (e-Manual MX-28, Goal Position (30))
+        item = replace(item, encoding="twos_complement")
+    lowest, highest = position_reach(table, continuous=True)
+    return replace(item, minimum=min(item.minimum, lowest), maximum=max(item.maximum, highest))
 
 
 def tick_range(item: ControlItem) -> tuple[int, int]:

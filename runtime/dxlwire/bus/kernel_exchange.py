@@ -93,10 +93,15 @@ class Reading(ReadRows):
         """Read by the kernel if it can; otherwise load the reads for `Lines.pump`, and return True."""
         if self.reads.stale or not self.by_kernel:
             self.by_kernel = self.exchange.plan_reads() and kernel
-        code = self.kernel.read() if self.by_kernel else Answer.UNEXPECTED
-        if not code:
-            return False
-        answer = self.kernel.finish_read(code)
+        try:
+            code = self.kernel.read() if self.by_kernel else Answer.UNEXPECTED
+            if not code:
+                return False
+            answer = self.kernel.finish_read(code)
+        except BaseException:  # Ctrl-C: replies to the kernel's request are still on the line
+            self.exchange.interrupt_kernel()
+            self.end_cycle()
+            raise
         if answer is Answer.LOOK:
             self._samples.accept_plausible(self.session.lines.clock.now_ns())
         if answer is not Answer.UNEXPECTED:
@@ -205,7 +210,7 @@ def _sync_writes(
             tuple(part),
             tuple(servos[row].servo_id for row in part),
             tuple(
-                [_cell(servos[row].table.items[name], layout, items.index(name), raw) for name in names]
+                [_cell(item_of(servos[row].table, name), layout, items.index(name), raw) for name in names]
                 for row in part
             ),
             always=True,

@@ -17,7 +17,7 @@ from dxlwire.exchange.goal_writes import LEADS
 from dxlwire.modes import Mode
 from dxlwire.plan.line import Line, listen_transaction
 from dxlwire.plan.mode_plan import in_mode, mode_plans
-from dxlwire.plan.retry import retry
+from dxlwire.plan.retry import ATTEMPTS, retry
 from dxlwire.transaction import BROADCAST_ID, Program, Reply, TransactionOutcome
 
 SHORT_TIMEOUT_NS = 3_000_000
@@ -25,6 +25,7 @@ SHORT_TIMEOUT_NS = 3_000_000
 SLOT_NS = 3_000_000
 """Time (ns) for each ID after a broadcast ping, in addition to the bytes of its answer (dynamixel-sdk,
 broadcastPing)."""
+USE_TORQUE = "use `servos.torque = True`, which first sets the goal to the present position"
 _FIELDS: Mapping[str, str] = {"position": "position", "velocity": "speed", "effort": "effort", "pwm": "pwm"}
 _MODE_REGISTERS = (
     "operating_mode",
@@ -158,7 +159,14 @@ def switch_torque(line: Line, servo: Addressed, on: bool) -> Program[None]:
         if any((yield from read_item(line, servo.servo_id, enable))):
             return
         yield from _reset_goal(line, servo)
-    yield from write_item(line, servo, enable, bytes((on,)))
+    for attempt in range(ATTEMPTS):
+        try:
+            yield from write_item(line, servo, enable, bytes((on,)))
+            return
+        except ServoFailed as error:
+            # Torque off is the one write that is better executed twice than not at all.
+            if on or error.failure.kind != "not_written" or attempt == ATTEMPTS - 1:
+                raise
 
 
 def _reset_goal(line: Line, servo: Addressed) -> Program[None]:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from typing import SupportsIndex
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dxlwire.bus.item_values import item_of, ticks_of, value_in
 from dxlwire.bus.kernel_exchange import Reading, Writing
 from dxlwire.bus.programs import (
+    USE_TORQUE,
     Addressed,
     Failures,
     ServoFailed,
@@ -26,6 +29,7 @@ from dxlwire.transaction import Program
 
 Value = float | str
 Values = Value | Sequence[Value] | Floats
+Switch = bool | Sequence[bool] | NDArray[np.bool_]
 
 
 class ServoGroup:
@@ -45,15 +49,16 @@ class ServoGroup:
         """Models of the servos."""
         return tuple(servo.table.model for servo in self.servos)
 
-    def part(self, ids: Sequence[int]) -> ServoGroup:
-        """Return a group of some of these servos, in the order of `ids`.
+    def part(self, ids: int | Sequence[int]) -> ServoGroup:
+        """Return a group of one or some of these servos, in the order of `ids`.
 
         Raises:
             LookupError: The group has no servo with one of these IDs.
         """
+        ids = [ids] if isinstance(ids, SupportsIndex) else ids
         known = {servo.servo_id: servo for servo in self.servos}
         if unknown := [each for each in ids if each not in known]:
-            raise LookupError(f"no servo with ID {unknown[0]} here; there are {', '.join(map(str, known))}")
+            raise LookupError(f"no servo with ID {unknown[0]} here; there are {list(known)}")
         return ServoGroup(self.session, [known[each] for each in ids])
 
     def read_values(self, item: str, *, raw: bool) -> Program[tuple[Floats, Failures]]:
@@ -71,26 +76,43 @@ class ServoGroup:
 
     def write_values(self, item: str, values: Values, *, raw: bool) -> Program[Failures]:
         """Write an item of every servo. All values are checked before the first one is sent."""
-        given = [values] * len(self.servos) if isinstance(values, (str, float, int)) else list(values)
-        if len(given) != len(self.servos):
-            raise ValueError(f"{item}: {len(given)} values for {len(self.servos)} servos")
+        given = self._one_each(item, values)
+        if item == "id" and len(set(given)) < len(given):
+            raise ValueError("id: two servos of one line cannot have the same ID")
         wanted: list[tuple[Addressed, ControlItem, bytes]] = []
         for servo, value in zip(self.servos, given, strict=True):
             one = item_of(servo.table, item)
             if one.access == "R":
                 raise ValueError(f"{one.title} of {servo.table.model} is read-only")
             if one.name == "torque_enable":
-                raise ValueError(
-                    "use `servos.torque = True`, which first sets the goal to the present position"
-                )
+                raise ValueError(USE_TORQUE)
             wanted.append((servo, one, one.encode(ticks_of(servo.table, one, value, raw=raw))))
         line = self.session.line
         return _all((servo.servo_id, write_item(line, servo, one, data)) for servo, one, data in wanted)
 
-    def switch_all(self, on: bool) -> Program[Failures]:
-        """Switch the torque of every servo on or off."""
+    def switch_all(self, on: Switch) -> Program[Failures]:
+        """Switch the torque of every servo on or off.
+
+        Raises:
+            ValueError: A value is neither true nor false.
+        """
+        given = self._one_each("torque", on)
+        if not all(isinstance(each, (bool, np.bool_)) for each in given):
+            raise ValueError("torque: use True or False")
         line = self.session.line
-        return _all((servo.servo_id, switch_torque(line, servo, on)) for servo in self.servos)
+        return _all(
+            (servo.servo_id, switch_torque(line, servo, bool(each)))
+            for servo, each in zip(self.servos, given, strict=True)
+        )
+
+    def _one_each(self, name: str, values: Values | Switch) -> list[Value]:
+        """Return one value for each servo. Raises ValueError if there are more or fewer."""
+        if isinstance(values, str) or np.ndim(values) == 0:
+            return [values] * len(self.servos)  # type: ignore[list-item]  # it is not a sequence
+        given: list[Value] = list(values)  # type: ignore[arg-type]
+        if len(given) != len(self.servos):
+            raise ValueError(f"{name}: {len(given)} values for {len(self.servos)} servos")
+        return given
 
     def make_reading(self, items: Sequence[str], *, raw: bool) -> Reading | SdkReading:
         """Return the exchange of a reader of these servos."""

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dxlwire.bus.item_values import item_of
-from dxlwire.bus.programs import Addressed
+from dxlwire.bus.programs import USE_TORQUE, Addressed
 from dxlwire.bus.session import OpenLine
 from dxlwire.control_table import ControlItem
 from dxlwire.exchange.arrays import Floats
@@ -45,6 +45,8 @@ class ServoStates:
         return np.where(self._age_ns < 0, np.nan, self._age_ns * 1e-9)
 
     def __getattr__(self, name: str) -> Floats:
+        if name.startswith("_"):  # `copy` and `pickle` ask for special methods before there are items
+            raise AttributeError(name)
         try:
             values: Floats = self._values[self._items[name]]
         except KeyError:
@@ -74,6 +76,7 @@ class ReadRows:
     def __init__(self, session: OpenLine, servos: Sequence[Addressed], items: Sequence[str]) -> None:
         if not items:
             raise ValueError("name at least one item")
+        check_different(items)
         session.cycles += 1
         count = len(servos)
         self.ids = tuple(servo.servo_id for servo in servos)
@@ -111,6 +114,7 @@ class WrittenRows:
     def __init__(self, session: OpenLine, servos: Sequence[Addressed], items: Sequence[str]) -> None:
         if not 1 <= len(items) <= len(COMMAND_INTERFACES):
             raise ValueError(f"name one to {len(COMMAND_INTERFACES)} items; {len(items)} were given")
+        check_different(items)
         session.cycles += 1
         self._goals: Floats = np.full((len(COMMAND_INTERFACES), len(servos)), np.nan)
         self._count = len(items)
@@ -125,11 +129,20 @@ class WrittenRows:
             raise TypeError(f"this writer takes {self._count} values, one for each item; got {len(values)}")
         for row, value in enumerate(values):
             self._goals[row] = value
+        if self._count > 1:  # Half of a servo's values would be sent with zeros or old ones for the rest
+            goals = self._goals[: self._count]
+            goals[:, np.isnan(goals).any(axis=0)] = np.nan
         self.send_goals()
 
     def send_goals(self) -> None:
         """Send the goals. Raises PortError if the line is closed or lost."""
         raise NotImplementedError
+
+
+def check_different(items: Sequence[str]) -> None:
+    """Raise ValueError if an item is named twice."""
+    if twice := next((name for name in items if items.count(name) > 1), None):
+        raise ValueError(f"{twice} is named twice")
 
 
 def writable_item(servo: Addressed, name: str) -> ControlItem:
@@ -146,6 +159,8 @@ def writable_item(servo: Addressed, name: str) -> ControlItem:
         raise ValueError(
             f"{item.title} of {servo.table.model} is in the EEPROM, which wears out; use `servos.write`"
         )
+    if item.name == "torque_enable":
+        raise ValueError(USE_TORQUE)
     return item
 
 

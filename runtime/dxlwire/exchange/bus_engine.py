@@ -118,6 +118,7 @@ class BusEngine:
         # Planned deadline of a reply whose deadline was extended; 0 without an extension
         self._planned_deadline_ns = 0
         self._last_byte_ns = -NEVER
+        self._answered_ns = -NEVER  # Time at which the replies to an abandoned request are off the line
         self._open = 0  # One bit for each status that is still awaited
         self._refused = False
 
@@ -151,6 +152,8 @@ class BusEngine:
     def drop_job(self) -> None:
         """Remove the loaded job. Replies that still arrive for it count as stray."""
         self._note_owed()
+        if self._state == _AWAITING and self._awaited is not None:
+            self._answered_ns = self._sent_ns + self._awaited.due_ns + self._quiet_ns
         self._job = self._awaited = self._held = None
         self._state = _READY
 
@@ -293,7 +296,8 @@ class BusEngine:
         now_ns = self.now_ns()
         _, free_ns = self.choose(transaction)
         # A duplicate follows its original at once, so the latency of the adapter does not count.
-        quiet_ns = min(self._quiet_at() - self._latency_ns, self._drain_end_ns)
+        # A job dropped in the middle of a reply, as on Ctrl-C: the next write would collide with its rest.
+        quiet_ns = min(max(self._quiet_at() - self._latency_ns, self._answered_ns), self._drain_end_ns)
         until_ns = min(max(free_ns, quiet_ns), now_ns + transaction.patience_ns)
         if until_ns <= now_ns:
             return False
