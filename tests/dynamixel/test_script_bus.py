@@ -173,6 +173,35 @@ def test_refusal_of_a_servo_is_told(script):
     assert caught.value.failures[1].kind == "refused"
 
 
+def test_servo_that_answers_no_read_is_told_from_a_silent_one_and_repaired(script):
+    servos = script.bus.scan([1])
+    servos.write("status_return_level", 0)
+    with pytest.raises(
+        ServoError, match=r"did not answer the read of LED \(65\), but answers a ping; write 2 to"
+    ):
+        servos.read("led")
+    servos.write("status_return_level", 2)
+    assert servos.read("status_return_level") == 2
+    script.simulated.servos[0].silence()
+    with pytest.raises(ServoError, match=r"did not answer the read of LED \(65\)$"):
+        servos.read("led")
+    old = Script("AX-12A:1", protocol=1.0)
+    old.bus.scan([1]).write("status_return_level", 0)
+    with pytest.raises(ServoError, match="did not answer the read of its model, but answers a ping"):
+        old.bus.scan([1])
+
+
+def test_refusal_because_of_the_watchdog_has_its_remedy(script):
+    servos = script.bus.scan([1])
+    servos.torque = True
+    servos.write("bus_watchdog", 0.02)
+    script.let_pass(0.1)
+    with pytest.raises(ServoError, match="its Bus Watchdog has stopped it: write 0 to `bus_watchdog`"):
+        servos.write("goal_position", 3.0)
+    servos.write("bus_watchdog", 0)
+    servos.write("goal_position", 3.0)
+
+
 def test_reader_and_writer_have_si_units_for_each_servo():
     script = Script("XM430-W350:1", "XL430-W250:5", "XL320:3")
     servos = script.bus.scan()
@@ -425,6 +454,22 @@ def test_asyncio_does_the_same_and_calls_take_turns():
     *states, temperatures = asyncio.run(work())
     assert all(state.valid.all() for state in states)
     assert (temperatures > 20).all()
+
+
+def test_asyncio_makes_servos_limp_after_a_call_timed_out(script):
+    async def work():
+        async with AsyncBus.on_session(script.session, limp_at_exit=True) as bus:
+            servos = await bus.scan()
+            await servos.switch_torque([True, True, False])
+            reading = asyncio.ensure_future(servos.reader("present_position")())
+            await asyncio.sleep(0)
+            await asyncio.sleep(0)
+            reading.cancel()
+            await reading
+
+    with pytest.raises(asyncio.CancelledError):
+        asyncio.run(work())
+    assert not any(servo.torque_on for servo in script.simulated.servos)
 
 
 def test_threads_share_a_bus_and_the_event_loop_waits_for_real_lines():

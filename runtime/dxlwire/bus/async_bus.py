@@ -14,11 +14,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from dxlwire.bus.blocking_bus import RATE
 from dxlwire.bus.kernel_exchange import Reading
-from dxlwire.bus.programs import find_ids, identify
+from dxlwire.bus.programs import Addressed, Failures, find_ids, identify
 from dxlwire.bus.sdk_exchange import SdkReading
 from dxlwire.bus.servo_group import ServoGroup, Switch, Values, found_group, named_servos
 from dxlwire.bus.servo_rows import ServoStates, WrittenRows
 from dxlwire.bus.session import SdkSession, Session, open_session
+from dxlwire.exceptions import ServoError
 from dxlwire.exchange.arrays import Floats
 from dxlwire.exchange.bus_engine import NEVER
 from dxlwire.transaction import Program, ProgramJob, Result
@@ -124,26 +125,40 @@ def _waiting_for(session: Session | SdkSession) -> _Waiting:
 class AsyncBus:
     """A serial line with servos for an asyncio program; an async context manager. See `Bus`."""
 
-    def __init__(self, port: str, baud_rate: int = RATE, protocol: float = 2.0) -> None:
+    def __init__(
+        self, port: str, baud_rate: int = RATE, protocol: float = 2.0, *, limp_at_exit: bool = False
+    ) -> None:
         """Open a line; the arguments and errors are those of `Bus`."""
         self._waiting = _waiting_for(open_session(port, baud_rate, protocol))
+        self._limp_at_exit = limp_at_exit
+        self._groups: list[ServoGroup] = []
 
     @classmethod
-    def on_session(cls, session: Session) -> AsyncBus:
+    def on_session(cls, session: Session, *, limp_at_exit: bool = False) -> AsyncBus:
         """Return a bus on a line that is open already, such as a simulated one on virtual time."""
         bus = cls.__new__(cls)
         bus._waiting = _waiting_for(session)
+        bus._limp_at_exit, bus._groups = limp_at_exit, []
         return bus
 
     async def __aenter__(self) -> AsyncBus:
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        self.close()
+        await self.close()
 
-    def close(self) -> None:
-        """Close the line; torque stays as it is."""
-        self._waiting.session.close()
+    async def close(self) -> None:
+        """Close the line, see `Bus.close`."""
+        groups, self._groups = self._groups, []
+        failures: Failures = {}
+        session = self._waiting.session
+        try:
+            for group in groups if self._limp_at_exit else ():
+                failures |= await self._waiting.run_program(group.switch_all(False))
+        finally:
+            session.close()
+        if failures:
+            raise ServoError(session.name, failures)
 
     def record(self, path: str | os.PathLike[str]) -> None:
         """Record all packets from now on in a new log, see `Bus.record`."""
@@ -157,13 +172,17 @@ class AsyncBus:
             find_ids(session.line, list(looked_for), session.log.answered)
         )
         found = await self._waiting.run_program(identify(session.line, dict.fromkeys(there)))
-        return AsyncServoSet(self._waiting, found_group(session, found))
+        return self._use(found)
 
     async def servos(self, models: Mapping[int, str]) -> AsyncServoSet:
         """Return servos by ID and model, see `Bus.servos`."""
         session = self._waiting.session
-        found = await self._waiting.run_program(named_servos(session, models))
-        return AsyncServoSet(self._waiting, found_group(session, found))
+        return self._use(await self._waiting.run_program(named_servos(session, models)))
+
+    def _use(self, found: tuple[list[Addressed], Failures]) -> AsyncServoSet:
+        group = found_group(self._waiting.session, found)
+        self._groups.append(group)
+        return AsyncServoSet(self._waiting, group)
 
 
 class AsyncServoSet:

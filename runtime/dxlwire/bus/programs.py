@@ -15,6 +15,7 @@ from dxlwire.control_table import ControlItem, ControlTable, models_by_number
 from dxlwire.exceptions import FailureKind, ServoFailure
 from dxlwire.exchange.goal_writes import LEADS
 from dxlwire.modes import Mode
+from dxlwire.plan.bus_watchdog import MOST_TICKS
 from dxlwire.plan.line import Line, listen_transaction
 from dxlwire.plan.mode_plan import in_mode, mode_plans
 from dxlwire.plan.retry import ATTEMPTS, retry
@@ -97,7 +98,8 @@ def identify(
         if ping.answered and line.dialect.PROTOCOL == 1.0:
             reply = yield from retry(line.read_range(servo_id, 0, 3))
         if not reply.answered:
-            failures[servo_id] = failure_of(line, reply, "the ping")
+            asked = "the ping" if reply is ping else "the read of its model"
+            failures[servo_id] = yield from _with_level(line, servo_id, failure_of(line, reply, asked))
             continue
         number, firmware = reply.word(), reply.parameters[2]
         if expected is not None and number != expected.model_number:
@@ -122,23 +124,42 @@ def read_item(line: Line, servo_id: int, item: ControlItem) -> Program[bytes]:
     """Read one item; return its bytes."""
     reply = yield from retry(line.read_range(servo_id, item.address, item.size))
     if not reply.answered:
-        raise ServoFailed(failure_of(line, reply, f"the read of {item.title}"))
+        failure = failure_of(line, reply, f"the read of {item.title}")
+        raise ServoFailed((yield from _with_level(line, servo_id, failure)))
     return bytes(reply.parameters)
+
+
+def _with_level(line: Line, servo_id: int, failure: ServoFailure) -> Program[ServoFailure]:
+    """Return the failure of a read, with a remedy if the servo answers a ping: at level 0 it answers only
+    that (e-Manual, Status Return Level)."""
+    if failure.kind == "no_reply" and (yield line.ping(servo_id)).answered:
+        text = "but answers a ping; write 2 to `status_return_level`, which may be 0"
+        return ServoFailure(failure.kind, f"{failure.text}, {text}")
+    return failure
 
 
 def write_item(line: Line, servo: Addressed, item: ControlItem, data: bytes) -> Program[None]:
     """Write one item. An EEPROM item is written only if it differs, and only while torque is off."""
     if item.area == "EEPROM":
-        if (yield from read_item(line, servo.servo_id, item)) == data:
-            return
-        if any((yield from read_item(line, servo.servo_id, servo.table.items["torque_enable"]))):
-            text = f"has torque, so {item.title} in its EEPROM was not written; switch torque off first"
-            raise ServoFailed(ServoFailure("torque_on", text))
+        try:
+            if (yield from read_item(line, servo.servo_id, item)) == data:
+                return
+            if any((yield from read_item(line, servo.servo_id, servo.table.items["torque_enable"]))):
+                text = f"has torque, so {item.title} in its EEPROM was not written; switch torque off first"
+                raise ServoFailed(ServoFailure("torque_on", text))
+        except ServoFailed as error:
+            # At level 0 the servo answers no read, and this write ends that.
+            if item.name != "status_return_level" or error.failure.kind != "no_reply":
+                raise
     reply = yield line.write_range(servo.servo_id, item.address, data)
     if reply.answered:
         return
     failure = failure_of(line, reply, f"the write of {item.title}")
     if reply.outcome is TransactionOutcome.REFUSED:
+        watchdog = servo.table.items.get("bus_watchdog")
+        if watchdog and watchdog.decode((yield from read_item(line, servo.servo_id, watchdog))) > MOST_TICKS:
+            text = f"{failure.text}; its Bus Watchdog has stopped it: write 0 to `bus_watchdog`"
+            failure = ServoFailure(failure.kind, text)
         raise ServoFailed(failure)
     # Whether the servo has executed the write is unknown.
     present = yield from retry(line.read_range(servo.servo_id, item.address, item.size))
