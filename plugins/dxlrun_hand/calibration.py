@@ -19,7 +19,7 @@ from dxlrun.tooling.robots import Replacement
 from dxlrun.tooling.servos import OneServo, Search, ToolLine, find_servo
 from dxlrun_hand.dialogue import Dialogue
 from dxlrun_hand.robot_text import RobotText
-from dxlwire import BusPlan, ControlTable, ServoPlan
+from dxlwire import BusPlan, ControlTable, ServoPlan, can_count_turns
 
 _degrees = ROTARY.number
 LEAST_WAY = math.radians(5.0)
@@ -107,13 +107,25 @@ class HandJoint:
         self.limp = True
         self._one.torque(False)
 
-    def start_counting(self) -> float:
-        """Start counting the servo's turns; return its angle, rad, within the turn that its goals reach."""
+    def start_counting(self, zero: float | None = None) -> float:
+        """Start counting the servo's turns; return its angle, rad, within the turn that its goals reach.
+
+        If the servo can count turns, this is the turn in which it is closest to the angle `zero`, rad, in the
+        zero pose.
+        """
         readings = sorted(self._read_raw() for _ in range(_READINGS))
         self._raw = readings[_READINGS // 2]
         # A servo that counted turns, such as in wheel mode, is in its first turn after power-up.
-        self._travelled = self.table.min_tick + (self._raw - self.table.min_tick) % self._turn
+        first = float(self.table.min_tick)
+        if zero is not None and self.counts_turns:
+            first = zero / self.table.rad_per_tick - self._turn / 2
+        self._travelled = self._raw + math.ceil((first - self._raw) / self._turn) * self._turn
         return self._angle
+
+    @property
+    def counts_turns(self) -> bool:
+        """True if goals reach every angle, because the servo can count turns and the joint is bounded."""
+        return not self.servo.continuous and can_count_turns(self.table)
 
     def read_angle(self) -> float:
         """Read the servo; return its angle, rad, counted across turns since `begin`.
@@ -141,12 +153,20 @@ class HandJoint:
         """
         tick = self.table.rad_per_tick
         least, most = self.table.min_tick * tick, self.table.max_tick * tick
+        if self.counts_turns:
+            least, most = lowest, lowest + self._turn * tick
         if not self.servo.continuous and (lowest < least - tick or highest > most + tick):
             raise TurnRangeFault(
                 f"{self.name} left the range of its {self.table.model}: goals are {_degrees(least)} to "
                 f"{_degrees(most)} deg, and its servo was at {_degrees(lowest)} to {_degrees(highest)} deg. "
-                "If the joint needs this range, turn the servo's horn first. Move the joint back."
+                f"{self._remedy} Move the joint back."
             )
+
+    @property
+    def _remedy(self) -> str:
+        if self.counts_turns:
+            return "If the joint needs more than a turn, write its limits yourself."
+        return "If the joint needs this range, turn the servo's horn first."
 
     @property
     def _angle(self) -> float:
@@ -184,7 +204,7 @@ def _measure(joint: HandJoint, zero: float, dialogue: Dialogue) -> JointCalibrat
     servo = joint.servo
     while True:
         try:
-            found = _ends(joint, dialogue)
+            found = _ends(joint, zero, dialogue)
         except TurnRangeFault as error:
             dialogue.ask_question(f"{error} Then press Enter ")
             continue
@@ -203,13 +223,13 @@ def _measure(joint: HandJoint, zero: float, dialogue: Dialogue) -> JointCalibrat
     )
 
 
-def _ends(joint: HandJoint, dialogue: Dialogue) -> tuple[float, float, float, float]:
+def _ends(joint: HandJoint, zero: float, dialogue: Dialogue) -> tuple[float, float, float, float]:
     """Ask the user to move a joint to its ends; return four angles of its servo, rad.
 
     They are the angles at the positive and at the other end, and the lowest and highest on the way. Raises
     BeyondTurn.
     """
-    begin = joint.start_counting()
+    begin = joint.start_counting(zero)
     seen = [begin, begin]
     now = begin
 
@@ -264,7 +284,7 @@ def replacements(
     """
     reference, direction, *position = keys_of(found.joint, continuous=servo.continuous)
     changes: list[Replacement] = []
-    if abs(servo.reference - found.reference) > found.tick:
+    if abs(servo.encoder_reference - found.reference) > found.tick:
         changes.append(Replacement(reference, _written(found.reference, ROTARY, text.unit(reference))))
     if servo.direction != found.direction:
         changes.append(Replacement(direction, found.direction))

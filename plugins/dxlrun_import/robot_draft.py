@@ -14,7 +14,7 @@ from dxlrun import InputError
 from dxlrun.tooling.files import Conversion, FileContent, Mark, Problem
 from dxlrun.tooling.robots import compile_texts
 from dxlrun_import.checked_values import refused, valid_name
-from dxlwire import ControlTable, find_table
+from dxlwire import ControlTable, can_count_turns, find_table
 
 RATES = (100, 50, 25, 20, 10, 5, 2, 1)
 """Loop rates to choose from, Hz."""
@@ -132,18 +132,25 @@ class RobotDraft:
             raise refused(joint.mark, what, "check their unit")
         ends = sorted(joint.direction * (math.degrees(tick * step) - reference) for tick in (first, last))
         within = max(low, ends[0]), min(high, ends[1])
+        beyond = within[0] > low + SLACK_DEG or within[1] < high - SLACK_DEG
+        if beyond and high - low < 360 and self._counts_turns(joint, table):
+            return joint._replace(limits=(low, high))
         if within[0] >= within[1]:
             what = (
                 f"the limits of {joint.name}, {low:g} to {high:g} deg, are outside its servo's travel, "
                 f"{ends[0]:.4g} to {ends[1]:.4g} deg"
             )
             raise refused(joint.mark, what, "check its offset, its direction and the unit")
-        if within[0] > low + SLACK_DEG or within[1] < high - SLACK_DEG:
+        if beyond:
             self.remarks.append(
                 f"limits of {joint.name}, {low:g} to {high:g} deg: its servo reaches only "
                 f"{ends[0]:.4g} to {ends[1]:.4g} deg"
             )
         return joint._replace(limits=within)
+
+    def _counts_turns(self, joint: JointDraft, table: ControlTable | None) -> bool:
+        """Return True if limits of a joint may cross raw 0 of its servo; nearly all of Protocol 2.0 can."""
+        return self.buses[joint.bus].protocol == 2.0 if table is None else can_count_turns(table)
 
     def conversion(self, urdf: str | None = None) -> Conversion:
         """Return the text of the robot file at a rate that the buses can keep, and the remarks.

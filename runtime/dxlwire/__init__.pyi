@@ -32,6 +32,7 @@ from dxlwire.modes import mode_of as mode_of
 from dxlwire.packets import PacketKind as PacketKind
 from dxlwire.plan.line import BITS_PER_BYTE as BITS_PER_BYTE
 from dxlwire.plan.line import TIMEOUT_MARGIN_NS as TIMEOUT_MARGIN_NS
+from dxlwire.plan.mode_plan import can_count_turns as can_count_turns
 from dxlwire.port.adapters import serial_devices as serial_devices
 from dxlwire.port.latency_timer import is_simulated as is_simulated
 from dxlwire.port.ports import Port as Port

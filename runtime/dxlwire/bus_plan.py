@@ -223,6 +223,11 @@ class ServoPlan(msgspec.Struct, frozen=True):
         return {setting.name: setting.value for setting in self.settings}
 
     @property
+    def encoder_reference(self) -> float:
+        """Reference of the robot file, rad from the servo's raw 0, without Homing Offset and turns."""
+        return self.reference - (self.homing_offset or 0) * self.rad_per_tick
+
+    @property
     def turn_ticks(self) -> int:
         """Ticks of one turn of the servo."""
         return round(math.tau / self.rad_per_tick)

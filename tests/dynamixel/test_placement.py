@@ -142,3 +142,82 @@ def test_guardian_recognizes_a_servo_that_the_start_made_count_turns():
     assert rig.servo(11).registers["operating_mode"] == 4
     stand(rig.lines)
     assert rig.torque() == [True]
+
+
+def crossing(**change):
+    """Return a plan of a joint whose zero is near raw 0, so that its limits are on both sides of it."""
+    x = {"reference": math.radians(10), "lower": -1.6, "upper": 1.6}
+    return make_x((11,), **x | change)
+
+
+@pytest.mark.parametrize("turns", [0, 3, -2])
+@pytest.mark.parametrize("joint", [1.0, -1.0])
+def test_joint_on_either_side_of_raw_0_starts_where_it_is(joint, turns):
+    rig = make_rig(crossing())
+    angle = math.radians(10) - joint
+    place_at(rig, angle)
+    if turns:
+        rig.servo(11).poke("operating_mode", 4)
+        turn_by_hand(rig.servo(11), angle + turns * math.tau)
+    rig.hardware.start()
+    rig.cycles(5)
+    assert rig.states.position[0] == pytest.approx(joint, abs=TICK)
+    assert rig.servo(11).registers["operating_mode"] == 4
+    rig.goals.position[0] = -joint
+    rig.cycles(100)
+    assert rig.states.position[0] == pytest.approx(-joint, abs=3 * TICK)
+
+
+@pytest.mark.parametrize("mode", [3, 4])
+def test_joint_beyond_limits_that_cross_raw_0_is_refused_with_its_position(mode):
+    """Nothing is written, even if its servo has another mode yet."""
+    rig = make_rig(crossing())
+    rig.servo(11).poke("operating_mode", mode)
+    place_at(rig, math.radians(10) + 2.5)
+    (problem,) = rig.refused()
+    assert "is at -143.3 deg, outside its limits -91.6..91.7 deg; move the joint inside by hand" in problem
+    assert not rig.writes()
+
+
+def test_joint_of_more_than_a_turn_is_refused_where_its_turn_is_not_known():
+    rig = make_rig(crossing(lower=-3.5, upper=3.5))
+    place_at(rig, math.radians(10) + 3.0)
+    (problem,) = rig.refused()
+    assert "is at -171.8 deg or 188.2 deg, each within its limits, and does not know its turn: " in problem
+    assert "move it between -159.5 deg and 159.4 deg by hand" in problem
+    place_at(rig, math.radians(10) + 2.7)
+    rig.hardware.start()
+    rig.cycles(2)
+    assert rig.states.position[0] == pytest.approx(-2.7, abs=TICK)
+
+
+def test_joint_that_does_not_know_its_turn_after_a_reboot_stays_limp_until_it_is_moved():
+    rig = make_rig(every_servo(crossing(lower=-3.5, upper=3.5), torque_on_return=True))
+    place_at(rig, math.radians(10))
+    rig.hardware.start()
+    rig.goals.position[0] = 3.3
+    rig.cycles(150)
+    servo = rig.servo(11)
+    servo.cut_power(rig.clock.now_ns() + 300_000_000)
+    rig.cycles(150)
+    assert not servo.torque_on
+    assert "does not know its turn" in rig.events.texts(EventCode.SERVO_LOST)[-1]
+    turn_by_hand(servo, math.radians(10) + 0.5)
+    rig.until_valid()
+    rig.cycles(10)
+    assert servo.torque_on
+    assert rig.states.position[0] == pytest.approx(-0.5, abs=TICK)
+
+
+def test_servo_that_is_taken_over_with_torque_does_not_move_when_it_begins_to_count_turns():
+    rig = make_rig(crossing(), take_over=True)
+    angle = math.radians(-40)
+    place_at(rig, angle)
+    servo = rig.servo(11)
+    servo.poke("goal_position", round(math.radians(320) / TICK))
+    servo.poke("torque_enable", 1)
+    rig.hardware.start()
+    rig.cycles(5)
+    assert servo.torque_on
+    assert math.remainder(servo.shaft_angle - angle, math.tau) == pytest.approx(0, abs=2 * TICK)
+    assert rig.states.position[0] == pytest.approx(math.radians(50), abs=2 * TICK)

@@ -86,7 +86,8 @@ def _source(written: object, servo: bool) -> Source:
 
 def _joint(joint: CompiledJoint, servos: Mapping[str, ServoPlan]) -> Row:
     plan, first, limits = joint.plan, joint.servos[0].described, joint.described.limits
-    unit, mode = joint.table.effort_unit, servos[first.name].start_mode.name
+    servo, unit = servos[first.name], joint.table.effort_unit
+    mode = ("extended " if servo.extended else "") + servo.start_mode.name
     return {
         "name": plan.name,
         **_described(first),

@@ -44,7 +44,9 @@ def present_offset(table: ControlTable, values: Mapping[str, int]) -> int:
 def in_one_turn(placed: ServoPlan, table: ControlTable) -> bool:
     """Return True if Position Control Mode, with its single turn, reaches all goals of a placed servo."""
     most = placed.turn_ticks // 4
-    fits = table.min_tick <= placed.lower_tick and placed.upper_tick <= table.max_tick
+    # The factory's limits of a PH54 are narrower than its Goal Position.
+    least, highest = (table.items[f"{end}_position_limit"].initial for end in ("min", "max"))
+    fits = (least or table.min_tick) <= placed.lower_tick and placed.upper_tick <= (highest or table.max_tick)
     return fits and abs(placed.homing_offset or 0) <= most
 
 

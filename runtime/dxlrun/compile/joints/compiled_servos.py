@@ -19,7 +19,7 @@ from dxlrun.features import stages
 from dxlsim.motor_model import MotorModel
 from dxlwire.bus_plan import BusPlan, RegisterValue
 from dxlwire.control_table import ControlTable, find_table, perhaps_meant, protocols_of
-from dxlwire.plan.mode_plan import mode_plans
+from dxlwire.plan.mode_plan import can_count_turns, mode_plans
 from dxlwire.wire.dialect import ONE_PROTOCOL
 
 _USUAL = {1.0: "AX-12A", 2.0: "XM430-W350"}  # assumed model if none is known, by protocol
@@ -27,6 +27,7 @@ MANY_TURNS = {1.0: 7, 2.0: 256}
 """Turns that a goal position can be away from raw 0, by protocol. Multi-turn Mode of MX (e-Manual MX-64,
 Goal Position (30): -28,672..28,672), Extended Position Control Mode (e-Manual XM430-W350, Goal Position
 (116): -1,048,575..1,048,575)."""
+_MOST_TURNS = 2  # of the travel of a joint that is not continuous: each of its positions occurs twice then
 _TEMPERATURE_LIMITS = ("motor_temperature_limit", "temperature_limit")
 """Items with the temperature limit of the motor: Y series, and all other models. Y also has a limit for its
 inverter."""
@@ -56,6 +57,13 @@ class CompiledServo(msgspec.Struct, frozen=True):
         else:
             reach = joint_reach(servo_travel(self.table), described.reference, described.direction)
         return reach.scaled(described.ratio, described.unit)
+
+    def counts_turns_for(self, needed: Interval) -> bool:
+        """Return True if the servo counts turns to reach these positions of its joint: less than two turns,
+        so that the start can find the turn."""
+        described = self.described
+        turns = (needed.upper - needed.lower) / abs(described.ratio) / math.tau
+        return not described.continuous and can_count_turns(self.table) and turns < _MOST_TURNS
 
     @property
     def top_speed(self) -> float:
@@ -239,6 +247,9 @@ def _one_table(model: str) -> bool:
 
 
 def _check_reference(file: RobotFile, servo: DescribedServo, table: ControlTable) -> None:
+    moved = [file.robot.joints[name] for name in servo.joints if name in file.robot.joints]
+    if can_count_turns(table) and all(joint.limits.position is not None for joint in moved):
+        return  # the limits are compared with the reach of the servo
     travel = servo_travel(table)
     if not travel.lower <= servo.reference <= travel.upper:
         file.warning(

@@ -23,6 +23,7 @@ from dxlrun.plan.loop_plan import LimitedInterface, ServoLimit
 from dxlwire.bus_plan import BusPlan, Field, GoalLayout, ModePlan, OwnLimit
 from dxlwire.modes import Mode
 from dxlwire.plan.mode_plan import in_mode, mode_in
+from dxlwire.plan.placement import nearest_turn
 from dxlwire.transaction import Program, TransactionOutcome
 
 ENGAGE_SPEED = 0.5
@@ -140,6 +141,7 @@ def settle_modes(plan: BusPlan, found: Findings) -> Program[list[dict[OwnLimit, 
             continue
         was = ", ".join(f"{one.items[name].title} was {value}" for name, value in before.items())
         words = servo.start_mode.name.lower().replace("_", "-")
+        words = f"extended {words}" if servo.extended else words
         found.add_event(servo.joint, texts.start_mode_set(str(one), was, words))
     return limits
 
@@ -204,6 +206,9 @@ def hold_servo(one: Access, wanted: Mode, *, inward: bool = False) -> Program[Ho
         if not state.answered:
             return HoldResult("did not answer when torque was to be switched on")
         present = servo.state.position.tick(state.parameters)
+        if servo.extended and not mode.lower_tick <= present <= mode.upper_tick:
+            servo = nearest_turn(servo, present)  # at the start its turn is not known yet
+            mode = servo.mode_plan(wanted)
         position = min(max(present, mode.lower_tick), mode.upper_tick)
         beyond = abs(position - present)
         unwound = servo.continuous and beyond * servo.rad_per_tick > FARTHEST_INWARD

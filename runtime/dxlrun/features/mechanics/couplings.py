@@ -22,12 +22,14 @@ from dxlrun.features.mechanics import form
 from dxlrun.features.mechanics.form import Transmission
 from dxlwire.joint_unit import ROTARY
 from dxlwire.modes import Mode
-from dxlwire.plan.mode_plan import model_modes
+from dxlwire.plan.mode_plan import can_count_turns, model_modes
 
 MOST_CONDITION = 100.0
 """Highest condition number of a transmission's matrix: beyond it one tick of a servo moves a joint by more
 than a hundred ticks. [i]"""
 MOST_SPEED_RATIO = 1.5  # highest ratio between the top speeds of a joint's servos [i]
+_TRIM = math.radians(1.0)
+"""Angle of a servo by which limits may exceed its reach: rounding, or a trimmed reference. [i]"""
 _LEAST_SHARE = 0.01  # least share of its reach for a joint without limits [i]
 
 Rows = tuple[tuple[float, ...], ...]
@@ -304,7 +306,7 @@ def allowed_limits(file: RobotFile, coupling: Coupling) -> tuple[Interval | None
                 "check reference and direction of each servo",
             )
             return (None,)
-        return (_allowed(file, name, joints[name], reach, coupling.servos[0].table.model),)
+        return (_allowed(file, name, joints[name], reach, coupling.servos),)
     written = [
         None if limits is None else Interval(float(limits[0]), float(limits[1]))
         for limits in (joints[name].limits.position for name in coupling.joints)
@@ -312,27 +314,44 @@ def allowed_limits(file: RobotFile, coupling: Coupling) -> tuple[Interval | None
     return box(file, coupling, written) or (None,) * len(written)
 
 
-def _allowed(file: RobotFile, name: str, joint: JointEntry, reach: Interval, model: str) -> Interval | None:
-    """Return a joint's limits from the file, cut to its servos' range; None if they do not overlap."""
+def _allowed(
+    file: RobotFile, name: str, joint: JointEntry, reach: Interval, servos: Sequence[CompiledServo]
+) -> Interval | None:
+    """Return a joint's limits from the file, cut to its servos' range unless they count turns; None after an
+    error."""
     limits = joint.limits.position
     if limits is None:
         return reach
-    mark = file.at("joints", name, "limits", "position")
+    mark, model = file.at("joints", name, "limits", "position"), servos[0].table.model
     written = Interval(float(limits[0]), float(limits[1]), reach.unit)
     allowed = written.meet(reach)
+    if reach.contains(written):
+        return allowed
+    beyond = max(reach.lower - written.lower, written.upper - reach.upper) / servos[0].described.ratio
+    if beyond > _TRIM and all(servo.counts_turns_for(written) for servo in servos):
+        file.warning(
+            mark,
+            f"{name} crosses raw 0 of its {model}, so it runs in extended position mode, which counts turns",
+            "turn its horn if the servo's own position limits shall apply, or ignore this",
+        )
+        return written
     if allowed is None:
         file.error(
             mark,
             f"limits {written} of {name} are outside the reach of its {model}, {reach}",
             "check limits, reference and direction",
         )
-    elif not reach.contains(written):
-        file.warning(
-            mark,
-            f"limits {written} of {name} exceed the reach of its {model}, {reach}",
-            f"write the effective limits {allowed}, or check reference and direction",
-        )
-    return allowed
+        return None
+    what = f"limits {written} of {name} exceed the reach of its {model}, {reach}"
+    fix = f"write the effective limits {allowed}"
+    if joint.continuous or beyond <= _TRIM:
+        file.warning(mark, what, f"{fix}, or check reference and direction")
+        return allowed
+    other = "turn the servo's horn so that raw 0 is outside its travel, or"
+    if all(can_count_turns(servo.table) for servo in servos):
+        other = "write `continuous: true` for a joint of several turns, or"
+    file.error(mark, what, f"{other} {fix}")
+    return None
 
 
 def shared_reach(coupling: Coupling) -> Interval | None:

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 from dxlrun.compile.joints.compiled_servos import CompiledServo
 from dxlrun.compile.joints.joint_drives import DriveStage, JointDrive
+from dxlrun.compile.joints.limits import Interval
 from dxlrun.compile.problems import RobotFile
 from dxlrun.features.mechanics.couplings import (
     Coupling,
@@ -36,7 +37,7 @@ def compile_drives(file: RobotFile, servos: Mapping[str, CompiledServo]) -> dict
                 servos=coupling.servos,
                 together=coupling.joints,
                 levers=tuple(row[column] for row in coupling.inverse),
-                reach=reaches[column],
+                reach=_wider(reaches[column], limits[column]),
                 allowed=limits[column],
                 modes=coupling.modes,
                 top_speed=speeds[column][0],
@@ -48,6 +49,11 @@ def compile_drives(file: RobotFile, servos: Mapping[str, CompiledServo]) -> dict
         if not coupling.direct and None not in limits and all(one.known_bus for one in coupling.servos):
             check_together(file, coupling)
     return drives
+
+
+def _wider(reach: Interval, allowed: Interval | None) -> Interval:
+    """Return the reach of a joint, which is that of its limits if its servos count turns to reach these."""
+    return reach if allowed is None or reach.contains(allowed) else allowed
 
 
 def _excluded(coupling: Coupling) -> dict[Mode, str]:

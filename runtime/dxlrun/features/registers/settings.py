@@ -102,7 +102,7 @@ def check_position_limits(file: RobotFile, plan: BusPlan) -> None:
     Multi-turn modes ignore the limits (e-Manual XM430-W350, Min/Max Position Limit (52, 48)).
     """
     for servo in plan.servos:
-        if servo.continuous:
+        if servo.continuous or servo.extended:
             continue
         for register, needed in _narrow(servo):
             file.error(
