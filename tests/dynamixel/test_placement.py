@@ -61,6 +61,17 @@ def test_homing_offset_is_taken_into_the_reference(offset, mode):
     is_at(rig, math.pi + 2.5)
 
 
+def test_offset_that_position_control_ignores_is_counted_by_extended_position_control():
+    """The goals would fit one turn: raw 1852 to 2244, and 1500 more."""
+    rig = make_rig(make_x((11,), lower=-0.3, upper=0.3))
+    rig.servo(11).poke("homing_offset", 1500)
+    place_at(rig, math.pi + 0.2)
+    rig.hardware.start()
+    rig.cycles(2)
+    is_at(rig, math.pi + 0.2)
+    assert rig.servo(11).registers["operating_mode"] == 4
+
+
 def test_homing_offset_is_in_the_log_with_what_to_do():
     rig = make_rig(make_x((11,)))
     rig.servo(11).poke("homing_offset", -3)
@@ -207,6 +218,27 @@ def test_joint_that_does_not_know_its_turn_after_a_reboot_stays_limp_until_it_is
     rig.cycles(10)
     assert servo.torque_on
     assert rig.states.position[0] == pytest.approx(-0.5, abs=TICK)
+
+
+def test_reboot_on_the_other_side_of_raw_0_changes_no_angle():
+    """The servo then counts from another turn."""
+    rig = make_rig(every_servo(crossing(), torque_on_return=True))
+    place_at(rig, math.radians(10) + 1.0)
+    rig.hardware.start()
+    rig.goals.position[0] = 1.0
+    rig.cycles(100)
+    servo = rig.servo(11)
+    assert servo.registers.ticks("present_position") < 0
+    servo.cut_power(rig.clock.now_ns() + 300_000_000)
+    rig.cycles(10)
+    rig.until_valid()
+    rig.cycles(10)
+    assert servo.torque_on
+    assert servo.registers.ticks("present_position") > 0
+    assert rig.states.position[0] == pytest.approx(1.0, abs=3 * TICK)
+    rig.goals.position[0] = -1.0
+    rig.cycles(100)
+    assert rig.states.position[0] == pytest.approx(-1.0, abs=3 * TICK)
 
 
 def test_servo_that_is_taken_over_with_torque_does_not_move_when_it_begins_to_count_turns():
