@@ -14,6 +14,7 @@ import pytest
 from tests.kit.line_faults import corrupt_next, truncate_next
 
 import dxlwire
+from dxlrun.cli.tools import tool_log
 from dxlrun.errors import InputError
 from dxlrun.log.log_reader import read_log
 from dxlsim import Ledger, SimulatedBus, VirtualPorts, bus_of_servos, serve_bus
@@ -427,6 +428,18 @@ def test_record_keeps_every_packet(script, tmp_path):
         assert b"".join(kept) == b"".join(there)
     with pytest.raises(InputError, match=r"script\.mcap"):
         Script(XM).bus.record(path)
+
+
+def test_recording_of_a_script_that_is_killed_is_read(script, tmp_path, monkeypatch):
+    monkeypatch.setattr(tool_log, "CHUNK_NS", 0)
+    path, copied = tmp_path / "script.mcap", tmp_path / "killed.mcap"
+    script.bus.record(path)
+    read = script.bus.scan().reader("present_position")
+    for _ in range(20):
+        read()
+    copied.write_bytes(path.read_bytes())  # as the file is after SIGKILL
+    script.bus.close()
+    assert len(read_log(copied).packets) == len(read_log(path).packets) > 40
 
 
 def test_asyncio_does_the_same_and_calls_take_turns():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -12,9 +13,12 @@ from dxlrun.output.target import check_target, unwritable
 from dxlrun.output.terminal import print_warning
 
 if TYPE_CHECKING:
+    from dxlrun.channels.ring import Payload
     from dxlwire.bus_plan import BusPlan
     from dxlwire.packets import PacketLog, PacketSink
 
+CHUNK_NS = 1_000_000_000
+"""Longest time (ns) of packets that are lost when a command or a script is killed."""
 TOOL_NAME = "tool"
 """Name of the log's metadata record with the `command` that wrote it."""
 
@@ -42,7 +46,16 @@ def tool_log(path: Path | None, command: str, buses: Sequence[str] = ("line",)) 
         writer = LogWriter(path, header)
     except OSError as error:
         raise unwritable(path, error) from error
-    packets = PacketBatch(Handover(writer.write_record))
+    chunk_ns = time.monotonic_ns()
+
+    def write_record(kind: int, payload: Payload) -> None:
+        nonlocal chunk_ns
+        writer.write_record(kind, payload)
+        if time.monotonic_ns() - chunk_ns >= CHUNK_NS:
+            writer.finish_chunk()
+            chunk_ns = time.monotonic_ns()
+
+    packets = PacketBatch(Handover(write_record))
     try:
         yield packets
     finally:
