@@ -103,6 +103,16 @@ def test_torque_goes_on_with_the_goal_at_the_present_position(script):
     assert servos.read("present_position", raw=True).tolist() == position.tolist()
 
 
+def test_torque_of_a_servo_beyond_its_limits_stays_off(script):
+    servos = script.bus.scan()
+    servos[2].write("min_position_limit", 3.5)
+    with pytest.raises(
+        ServoError, match=r"ID 2 on line is at 3.142 rad, outside its limits 3.501 to 6.282 rad, so"
+    ):
+        servos.torque = True
+    assert servos.torque.tolist() == [True, False, True]
+
+
 def test_torque_goes_on_at_rest_in_a_mode_without_a_position_goal(script):
     servo = script.bus.servos({2: "XM430-W350"})
     servo.write("operating_mode", "velocity")

@@ -28,6 +28,7 @@ SLOT_NS = 3_000_000
 broadcastPing)."""
 USE_TORQUE = "use `servos.torque = True`, which first sets the goal to the present position"
 _FIELDS: Mapping[str, str] = {"position": "position", "velocity": "speed", "effort": "effort", "pwm": "pwm"}
+_LIMITS = ("min_position_limit", "max_position_limit", "cw_angle_limit", "ccw_angle_limit")
 _MODE_REGISTERS = (
     "operating_mode",
     "control_mode",
@@ -200,12 +201,34 @@ def _reset_goal(line: Line, servo: Addressed) -> Program[None]:
     lead = "position" if plan is None else LEADS.get(plan.mode, "position")
     if plan is None or lead == "position":
         position = yield from read_item(line, servo.servo_id, items["present_position"])
-        # This write switches torque on in Protocol 1.0.
-        yield from write_item(line, servo, items["goal_position"], position)
+        try:
+            # This write switches torque on in Protocol 1.0.
+            yield from write_item(line, servo, items["goal_position"], position)
+        except ServoFailed as error:
+            raise ServoFailed((yield from _with_limits(line, servo, position, error.failure))) from None
         return
     address, place = _lead_field(plan, lead)
     goal = next(item for item in items.values() if item.address == address + place.offset)
     yield from write_item(line, servo, goal, bytes(goal.size))
+
+
+def _with_limits(
+    line: Line, servo: Addressed, position: bytes, failure: ServoFailure
+) -> Program[ServoFailure]:
+    """Return the failure of a goal at the present position; it has a remedy if that is beyond the limits."""
+    items = servo.table.items
+    ends = [items[name] for name in _LIMITS if name in items]
+    if failure.kind != "refused":
+        return failure
+    limits = []
+    for item in ends:
+        limits.append(item.value((yield from read_item(line, servo.servo_id, item))))
+    present = items["present_position"].value(position)
+    if not limits or min(limits) <= present <= max(limits):
+        return failure
+    text = f"is at {present:.3f} rad, outside its limits {min(limits):.3f} to {max(limits):.3f} rad"
+    names = " and ".join(item.title for item in ends)
+    return ServoFailure(failure.kind, f"{text}, so torque stays off; turn it by hand, or change {names}")
 
 
 def _mode_in(table: ControlTable, found: Mapping[str, int]) -> ModePlan | None:
