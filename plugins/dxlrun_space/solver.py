@@ -34,6 +34,8 @@ _NEAR_M: Final = 1e-3
 """Position error of the first starts, m, beyond which a pose counts as out of reach."""
 _POSTURE: Final = 1e-5
 """Weight of the distance from the posture, as a fraction of the arm's length, m/rad."""
+_PULL: Final = 0.02
+"""Weight of the posture of an arm with more joints than a pose needs, as a fraction of the length, m/rad."""
 _LONGEST_STEP: Final = 1.0
 """Largest change of a joint in a step, rad or m: the linear model is not valid for more."""
 _STILL: Final = 1e-7
@@ -164,7 +166,13 @@ class Solver:
             steps: Most steps.
             leash: Largest distance from the start in which the posture attracts a joint, rad or m.
         """
-        found = yield from self._descend(target, start, EXACT if exact else NEAREST, steps, leash)
+        weight = EXACT if exact else NEAREST
+        if self._redundant:
+            # First a strong pull, which moves the tip by 0.1 mm, then the pose from there.
+            self._tendency = (_PULL * self.chain.length) ** 2
+            start = (yield from self._descend(target, start, weight, steps, leash)).positions
+            self._tendency, leash = (_POSTURE * self.chain.length) ** 2, 0.0
+        found = yield from self._descend(target, start, weight, steps, leash)
         if not exact and found.residual.position > CLOSE_M:
             # Near a singularity even the small weight of the orientation moves the position.
             found = yield from self._descend(target, found.positions, 0.0, steps, leash)
@@ -183,7 +191,7 @@ class Solver:
         ]
         model = self._model(target, now, posture, weight)
         for _ in range(steps):
-            if model.residual.is_exact and not self._redundant:
+            if model.residual.is_exact and self._tendency < model.weight * 1e-3:
                 break
             change = self._step(model, now, damping)
             trial = self._inside([a + b for a, b in zip(now, change, strict=True)])

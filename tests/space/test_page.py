@@ -5,6 +5,7 @@ from __future__ import annotations
 from contextlib import nullcontext
 from pathlib import Path
 
+import numpy as np
 import pytest
 from tests.kit.commands import Dxlrun
 from tests.kit.judged_arms import arms
@@ -38,3 +39,24 @@ def test_commands_of_the_page(dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch) -
     assert tips[0] == pytest.approx([0.2, 0.0, 0.15], abs=1e-3)  # within the ticks of servos
     assert tips[1] - tips[0] == pytest.approx([0.0, 0.0, 0.05], abs=1e-3)
     assert {state.status for state in robot.goals()} == {"reached"}
+
+
+def test_the_measured_tip_stays_on_a_line_of_20_cm() -> None:
+    """Servos lag behind along the line, and leave it by their ticks."""
+    link = VirtualLink(plan_of(ROBOTS / "open_manipulator_x_space.yaml"))
+    robot, arm, tips = RemoteRobot("arm", link), arms()["open_manipulator_x"], []
+    robot.send("arm", "pose", {"x": 0.2, "y": -0.1, "z": 0.15, "path": "joints"})
+    for _ in range(500):
+        link.run_cycle()
+    link.new()
+    done = robot.send("arm", "pose", {"dy": 0.2})
+    assert done.goal is not None
+    for _ in range(300):
+        link.run_cycle()
+    cycles, _ = link.new()
+    for row in cycles["position"]:
+        tips.append(arm.matrix(row[: len(arm.joints)])[:3, 3])
+    off = np.array(tips) - tips[0]
+    assert np.abs(off[:, [0, 2]]).max() < 2e-3
+    assert off[-1] == pytest.approx([0.0, 0.2, 0.0], abs=3e-3)  # at rest a servo is up to 0.4 deg off
+    assert robot.goal_state(done.goal.number).status == "reached"
