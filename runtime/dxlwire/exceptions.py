@@ -15,7 +15,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 HELP = "https://example.org/dxlrun/how-to/it-does-not-work"
 """Address of the page "It does not work": a placeholder that a maintainer sets here, as `Issues` in
@@ -86,8 +86,7 @@ class PortError(DxlError, OSError):
 FailureKind = Literal["no_reply", "refused", "torque_on", "not_written", "wrong_model", "unknown_model"]
 
 
-@dataclass(frozen=True, slots=True)
-class ServoFailure:
+class ServoFailure(NamedTuple):  # A dataclass takes longer to import, and every command imports this module
     """Failure of one servo: its kind, for programs, and a sentence for people."""
 
     kind: FailureKind
