@@ -6,7 +6,7 @@ The texts have the form of `tests/kit/cases.py`. The head is a robot file, or a 
     A jammed joint misses its goal
       run 3 s leader_torque:=off       duration, and arguments of the robot file
       id: 1, => id: 1, tolerance: 8 deg,
-      play                             the motion of this text, or one of `robots/motions`
+      play                             the motion of this text, one of `robots/motions`, or a name
       jam servo=2 at=500ms             a fault, as `dxlrun --fault` has it
       hand servo=2 by=-30 at=1300ms    a hand turns a shaft by degrees at once, against the servo
       at 0.2 arm trajectory {points: [{time: 1, positions: [0.7, 0]}]}
@@ -41,6 +41,7 @@ from tests.kit.line_faults import turn_by_hand
 
 from dxlrun.channels.answers import Completion
 from dxlrun.channels.event_records import EventCode
+from dxlrun.compile.motion_names import is_name
 from dxlrun.log.log_reader import Log, open_log, read_log
 from dxlrun.testing import VirtualRobot, simulated_robot
 from dxlrun_analysis.replay import replay_log
@@ -63,7 +64,7 @@ class Story:
     def __init__(self, folder: Path, text: Path, robot: str, motion: str, shafts: Iterable[int]) -> None:
         self.folder, self.beside, self.robot, self.motion = folder, text.parent, robot, motion
         self.seconds, self.arguments = 0.0, dict[str, str]()
-        self.play, self.asks, self.faults = list[Path](), list[Ask](), list[Any]()
+        self.play, self.asks, self.faults = list[Path | str](), list[Ask](), list[Any]()
         self.hands: list[tuple[int, float, int]] = []
         self.goals: list[dict[str, Any]] = []
         self.shafts: dict[int, list[float]] = {number: [] for number in shafts}
@@ -82,7 +83,7 @@ class Story:
         elif word == "play":
             own = self.folder / "own_motion.yaml"
             own.write_text(self.motion)
-            self.play.append(ROBOTS / "motions" / rest if rest else own)
+            self.play.append(own if not rest else rest if is_name(rest) else ROBOTS / "motions" / rest)
         elif word == "hand":
             match = re.fullmatch(r"servo=(\d+) by=([-\d.]+) at=(\d+)ms", rest)
             assert match, "write hand servo=ID by=DEGREES at=TIMEms"
@@ -106,7 +107,7 @@ class Story:
         file, path = self.folder / "own.yaml", self.folder / "run.mcap"
         file.write_text(self.robot)
         options: dict[str, Any] = {"arguments": self.arguments, "play": self.play, "log": path}
-        robot = simulated_robot(file, duration_s=self.seconds, **options)
+        robot = simulated_robot(file, duration_s=self.seconds or None, **options)
         client = clients_of(robot, self.asks)
         FaultScript(self.faults).attach(robot.buses)
         for number, by, at_ns in self.hands:

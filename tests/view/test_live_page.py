@@ -19,8 +19,9 @@ from tests.view.served import Served
 
 from dxlrun import Refused, RemoteRobot
 from dxlrun_view.actions import StopAction
-from dxlrun_view.live_robot import LiveRobot
+from dxlrun_view.live_robot import LiveRobot, offered_motions
 from dxlrun_view.page_server import HEADER
+from dxlrun_view.shown import ViewedController, ViewedRobot
 
 Serve = Callable[..., Served]
 ACTIONS: tuple[dict[str, object], ...] = (
@@ -72,6 +73,12 @@ def column(served: Served, name: str) -> Any:
     seen = served.look(shown=True)
     values = seen["moment"]["values"]
     return values[seen["shown"]["columns"].index(name)] if values else None
+
+
+def test_it_offers_motions_of_controllers() -> None:
+    pages = ViewedController("pages", "keyframe_player", True, motions={"march": None, "bow": 1.0})
+    robot = ViewedRobot("two", controllers=(pages,), file="/nowhere/two.yaml")
+    assert [*offered_motions(robot)] == ["pages/march", "pages/bow"]
 
 
 def test_it_follows_the_robot(live: LiveRobot, serve: Serve) -> None:

@@ -326,6 +326,7 @@ def _loop(log: Log, plan: LoopPlan) -> LoopPlan:
         plan,
         commands=tuple(command for number, command in enumerate(plan.commands) if number in taken),
         end_ns=None,
+        ends_with_goals=False,
         overrun="skip",
         policies=_policies(log, plan.policies),
     )

@@ -51,8 +51,8 @@ GraphFile = Annotated[
 """Option `--graph`; without a file it is an empty tuple, and None when it is not given."""
 RobotPath = Annotated[Path, Parameter(help="Robot file.")]
 RobotName = Annotated[str | None, Parameter(help="Name of the robot, if several run.")]
-Motions = Annotated[tuple[Path, ...], Parameter(negative=(), show_default=False)]
-"""Motion files; the option can be given several times."""
+Motions = Annotated[tuple[str, ...], Parameter(negative=(), show_default=False, name="--play")]
+"""Motion files, or names of motions; the option can be given several times."""
 Without = Annotated[
     tuple[str, ...],
     Parameter(
@@ -100,7 +100,7 @@ SHORTEST_S, LONGEST_S = 1e-6, 1e9
 def compiled(
     robot: Path,
     assignments: Sequence[str],
-    play: Sequence[Path],
+    play: Sequence[Path | str],
     duration: float | None,
     ask: Ask | None = None,
     *,

@@ -75,7 +75,7 @@ def run(
     duration
         Duration of the run, s, or with a unit: 500ms, 2min.
     play
-        Motion file to play. Can be given several times.
+        Motion file, or name of a motion as for `dxlrun play`. Can be given several times.
     record
         Write a log.
     take_over
@@ -105,6 +105,12 @@ def run(
     result = compiled(robot, assignments, play, duration, None if virtual else read_models, without=without)
     for warning in result.warnings:
         print_warning(str(warning))
+    endless = next((part for part in result.parts if part.end_ns is None), None)
+    if virtual and duration is None and endless is not None:
+        raise InputError(
+            f"{endless.file} is played until it is cancelled, which nobody does on virtual time; give "
+            "--duration SECONDS"
+        )
     if ledger is not None:
         if not result.plan.simulated:
             raise InputError(

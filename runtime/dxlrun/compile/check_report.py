@@ -192,7 +192,7 @@ def _motion(part: MotionPart) -> Row:
         "file": part.file,
         "controller": part.controller,
         "start": part.start_ns * 1e-9,
-        "end": part.end_ns * 1e-9,
+        "end": None if part.end_ns is None else part.end_ns * 1e-9,
         "commands": len(part.commands),
         "points": part.points,
     }

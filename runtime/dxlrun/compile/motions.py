@@ -15,7 +15,8 @@ the first point until then.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 import msgspec
@@ -26,6 +27,7 @@ from pydantic import ValidationError
 from dxlrun.compile.controller_entry import CompiledController
 from dxlrun.compile.joints.compiled_joints import CompiledJoint
 from dxlrun.compile.joints.limits import check_samples
+from dxlrun.compile.motion_names import PLAY, FoundMotion, find_motion
 from dxlrun.compile.motion_samples import (
     QUANTITIES,
     MotionSample,
@@ -35,11 +37,11 @@ from dxlrun.compile.motion_samples import (
     formula_texts,
     listed_samples,
 )
-from dxlrun.compile.problems import Problems
+from dxlrun.compile.problems import Problems, RobotFile
 from dxlrun.contract.controller import Controller, SpeedPeak
 from dxlrun.description.document import refusal
 from dxlrun.description.form_problems import sentences_of
-from dxlrun.description.motion import FormulaPart, MotionDescription, PointsPart
+from dxlrun.description.motion import FormulaPart, MotionDescription, PointsPart, read_motion
 from dxlrun.errors import InputError, Mark, suggestion
 from dxlrun.plan.loop_plan import SETTLE_NS, JointPlan, ScheduledCommand, ScheduledGoal
 from dxlrun.plan.robot_plan import MotionPart
@@ -62,6 +64,29 @@ MOST_TARGETS = 200_000
 300 bytes and 5 us."""
 # Characters of formulas times evaluations; each takes up to 0.5 us, so 10 s in total.
 MOST_CHARACTERS = 20_000_000
+
+
+def compile_motions(
+    motions: Iterable[MotionDescription | str],
+    controllers: Mapping[str, CompiledController],
+    joints: Mapping[str, CompiledJoint],
+    file: RobotFile,
+) -> tuple[list[MotionDescription], list[MotionPart]]:
+    """Return the motion files of all motions, and their parts; those with mistakes are omitted.
+
+    Motions can be names of motion files or of controllers' own motions.
+    """
+    names = tuple(file.robot.controllers)
+    played: list[MotionDescription] = []
+    parts: list[MotionPart] = []
+    for one in motions:
+        found = _resolve_motion(one, file, controllers) if isinstance(one, str) else one
+        if isinstance(found, MotionDescription):
+            played.append(found)
+            parts += compile_motion(found, controllers, names, joints, file)
+        elif found is not None:
+            parts += _compile_own_motion(found, file, controllers)
+    return played, parts
 
 
 def compile_motion(
@@ -114,6 +139,55 @@ def compile_motion(
     return parts
 
 
+def _resolve_motion(
+    word: str, file: RobotFile, controllers: Mapping[str, CompiledController]
+) -> MotionDescription | FoundMotion | None:
+    """Return the motion file or the controller's own motion that a name stands for.
+
+    Returns None if an error was added, or if earlier errors may hide the motion.
+    """
+    players = {}
+    for name, controller in controllers.items():
+        # A plug-in whose code fails has a warning of `check_motions`.
+        with suppress(Exception):
+            players[name] = tuple(controller.offer.controller.motions(controller.parameters))
+    try:
+        found = find_motion(word, file.robot.name, file.description.path, players)
+        return (
+            found
+            if found.player
+            else read_motion(found.path, file.description.groups, file.description.omitted)
+        )
+    except InputError as error:
+        what, _, fix = str(error).partition("; ")
+        if error.problems:
+            file.extend(error.problems)
+        elif len(controllers) == len(file.robot.controllers):
+            file.error(file.key("controllers"), what, fix)
+        return None
+
+
+def _compile_own_motion(
+    found: FoundMotion, file: RobotFile, controllers: Mapping[str, CompiledController]
+) -> list[MotionPart]:
+    """Return a part that begins a controller's own motion with the run; empty if an error was added."""
+    name, controller = found.player, controllers[found.player]
+    mark = file.key("controllers", name, "motions", found.name)
+    if not controller.plan.active:
+        _refuse_inactive(file.key("controllers", name), name, file)
+        return []
+    seconds = controller.offer.controller.motions(controller.parameters)[found.name]
+    end_ns = round(seconds * 1e9) if math.isfinite(seconds) else None
+    try:
+        command = prepared(controller, PLAY, {"motion": found.name}, 0, mark)
+    except InputError as error:
+        file.extend(error.problems)
+        return []
+    origin = str(Mark(found.name, mark.line, mark.column))
+    command = structs.replace(command, goal=ScheduledGoal(end_ns), origin=origin)
+    return [MotionPart(found.name, name, 0, end_ns, 0, (command,), mark)]
+
+
 def check_times(parts: Sequence[MotionPart], duration_ns: int | None, problems: Problems) -> None:
     """Refuse a part that starts while its controller still plays another; warn if the run ends too early."""
     by_start = sorted(parts, key=lambda part: part.start_ns)
@@ -121,27 +195,33 @@ def check_times(parts: Sequence[MotionPart], duration_ns: int | None, problems: 
         replaced = [
             one
             for one in by_start[:index]
-            if one.controller == part.controller and one.motion_end_ns > part.start_ns
+            if one.controller == part.controller and _end_ns(one) > part.start_ns
         ]
         if replaced:
-            last = max(replaced, key=lambda one: one.motion_end_ns)
+            last = max(replaced, key=_end_ns)
+            end = "at a cancel" if last.end_ns is None else f"at {_seconds(_end_ns(last))}"
+            later = f"write start: {_seconds(last.end_ns)}, or " if last.end_ns and part.points else ""
             problems.error(
                 part.mark,
                 f"this motion of {part.controller} starts at {_seconds(part.start_ns)}, but the motion at "
-                f"{last.mark} ends at {_seconds(last.motion_end_ns)}",
-                f"write start: {_seconds(last.end_ns)}, or play the motions in two runs",
+                f"{last.mark} ends {end}",
+                f"{later}play the motions in two runs",
             )
     for part in parts:
-        if duration_ns is not None and part.motion_end_ns > duration_ns:
+        if duration_ns is not None and part.end_ns is not None and _end_ns(part) > duration_ns:
             problems.warning(
                 part.mark,
-                f"the motion of {part.controller} ends at {_seconds(part.motion_end_ns)}, but the run ends "
+                f"the motion of {part.controller} ends at {_seconds(_end_ns(part))}, but the run ends "
                 f"at {_seconds(duration_ns)}",
                 "omit --duration",
             )
 
 
-def _seconds(time_ns: int) -> str:
+def _end_ns(part: MotionPart) -> float:
+    return math.inf if part.motion_end_ns is None else part.motion_end_ns
+
+
+def _seconds(time_ns: float) -> str:
     return f"{time_ns / 1e9:.4g} s"
 
 
@@ -199,13 +279,14 @@ def _controller(
         return None
     controller = controllers.get(name)
     if controller is not None and not controller.plan.active:
-        problems.error(
-            mark,
-            f"controller {name} is not active at start",
-            "write active: true in the robot file, or choose an active controller",
-        )
+        _refuse_inactive(mark, name, problems)
         return None
     return controller
+
+
+def _refuse_inactive(mark: Mark, name: str, problems: Problems) -> None:
+    what = f"controller {name} is not active at start"
+    problems.error(mark, what, "write active: true in the robot file, or choose an active controller")
 
 
 def playable(

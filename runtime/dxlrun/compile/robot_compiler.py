@@ -28,6 +28,7 @@ from dxlrun.compile.joints.compiled_joints import (
 from dxlrun.compile.joints.compiled_urdf import compile_frames, compile_urdf
 from dxlrun.compile.joints.described_servos import AUTO, used_features
 from dxlrun.compile.joints.motors import read_motors
+from dxlrun.compile.motion_names import is_name
 from dxlrun.compile.orientations import check_orientations
 from dxlrun.compile.policies import compile_policies
 from dxlrun.compile.problems import RobotFile
@@ -87,7 +88,7 @@ class CompiledRobot(msgspec.Struct, frozen=True):
 def compile_files(
     robot: Path,
     arguments: Mapping[str, str],
-    motions: Sequence[Path],
+    motions: Sequence[Path | str],
     duration_ns: int | None = None,
     ask: Ask | None = None,
     *,
@@ -99,7 +100,7 @@ def compile_files(
     Args:
         robot: Robot file.
         arguments: Arguments of the robot file.
-        motions: Motion files.
+        motions: Motion files, or names of motions as text.
         duration_ns: Duration of the run; None: until the last motion ends.
         ask: Reads the models of servos on real ports with `model: auto`; called only after all checks passed.
         replacements: Values that replace those of the robot file.
@@ -111,7 +112,7 @@ def compile_files(
     description: Description | None = None
     groups: Groups = NO_GROUPS
     omitted: tuple[str, ...] = ()
-    read: list[MotionDescription] = []
+    read: list[MotionDescription | str] = []
     problems: list[Problem] = []
     try:
         description = read_robot(robot, arguments, replacements, without)
@@ -123,7 +124,8 @@ def compile_files(
         from dxlrun.description.motion import read_motion
 
         try:
-            read.append(read_motion(path, groups, omitted))
+            named = isinstance(path, str) and is_name(path)
+            read.append(str(path) if named else read_motion(Path(path), groups, omitted))
         except InputError as error:
             problems += error.problems
     if description is None or problems:
@@ -147,7 +149,7 @@ def _unknown(description: Description) -> list[str]:
 
 def compile_robot(
     description: Description,
-    motions: Sequence[MotionDescription],
+    motions: Sequence[MotionDescription | str],
     duration_ns: int | None = None,
     models: Mapping[str, str] | None = None,
 ) -> CompiledRobot:
@@ -155,7 +157,7 @@ def compile_robot(
 
     Args:
         description: The robot.
-        motions: The motions.
+        motions: The motions, or their names.
         duration_ns: Duration of the run. None: it ends after the last motion; without motions it runs until
             it is stopped.
         models: Models that were read from the servos of joints with `model: auto`, by joint.
@@ -197,16 +199,16 @@ def compile_robot(
     policy_keys = [one for _, one in stages(PolicyKey, features) if one.does]
     policies = compile_policies(file, joints, buses, policy_keys)
     parts: list[MotionPart] = []
+    played: list[MotionDescription] = []
     if motions:
-        from dxlrun.compile.motions import check_times, compile_motion  # as above
+        from dxlrun.compile.motions import check_times, compile_motions  # as above
 
-        names = tuple(file.robot.controllers)
-        for motion in motions:
-            parts += compile_motion(motion, controllers, names, joints, file)
+        played, parts = compile_motions(motions, controllers, joints, file)
         check_times(parts, duration_ns, file)
     file.raise_errors()
-    if duration_ns is None and parts:
-        duration_ns = max(part.end_ns for part in parts)
+    if duration_ns is None and all(part.points for part in parts):
+        # The approach of a controller's own motion takes a time that is not known before the run.
+        duration_ns = max((part.end_ns or 0 for part in parts), default=None)
     commands = (command for part in parts for command in part.commands)
     settings = file.robot.loop
     loop = LoopPlan(
@@ -216,6 +218,7 @@ def compile_robot(
         controllers=tuple(controller.plan for controller in controllers.values()),
         commands=tuple(sorted(commands, key=lambda command: command.at_ns)),
         end_ns=duration_ns,
+        ends_with_goals=duration_ns is None and bool(parts),
         policies=policies,
         overrun=settings.overrun,
         tolerated_skips=settings.tolerated_skips,
@@ -242,7 +245,7 @@ def compile_robot(
         source_text=description.text,
         arguments=dict(description.arguments),
         included={os.path.relpath(name, folder): text for name, text in texts.items()} | code,
-        played={os.path.relpath(motion.path, folder): motion.text for motion in motions},
+        played={os.path.relpath(motion.path, folder): motion.text for motion in played},
         frames=frames,
         simulation=simulation,
         groups=description.groups,

@@ -168,6 +168,8 @@ class ControlLoop:
             # A motion that ends late must not shorten the settling time of its goal.
             if end_ns is not None and schedule.grid_ns >= end_ns and not self.manager.settles:
                 return "ended", ""
+            if self.plan.ends_with_goals and self.manager.has_played:
+                return "ended", ""
             if self._stop.requested:
                 return "stopped", ""
             if self._actions.ending:

@@ -342,7 +342,9 @@ class ControllerPlan(msgspec.Struct, frozen=True):
 class ScheduledGoal(msgspec.Struct, frozen=True):
     """Goal of a played motion for one controller."""
 
-    end_ns: int  # End of the motion since the loop's first deadline, when the goal is judged
+    end_ns: int | None
+    """End of the motion since the loop's first deadline, when the goal is judged. None: it is played until it
+    is cancelled."""
     positions: tuple[float | None, ...] = ()
     """Target of each joint of the controller, rad or m; None: it must only be at rest. Empty: neither is
     checked."""
@@ -370,8 +372,9 @@ class LoopPlan(msgspec.Struct, frozen=True):
     joints: tuple[JointPlan, ...]
     controllers: tuple[ControllerPlan, ...]
     commands: tuple[ScheduledCommand, ...]  # Sorted by time
-    end_ns: int | None  # End of the run since the first deadline; None: run until a stop request
+    end_ns: int | None  # End of the run since the first deadline; None: see `ends_with_goals`
     overrun: OverrunPolicy = "skip"
+    ends_with_goals: bool = False  # A run without `end_ns` ends with its last goal
     tolerated_skips: float = TOLERATED_SKIPS  # Share of skipped periods up to which a run counts as good
     least_period_ns: int = 0  # Shortest period for the time budget of the buses; 0: not computed
     slowest_period_ns: int = 0  # Longest period for the Bus Watchdog; 0: unlimited

@@ -32,7 +32,8 @@ class UnreachedGoal(NamedTuple):
 def find_unreached_goals(loop: LoopPlan, goals: GoalTotals, ran_ns: int) -> Iterator[UnreachedGoal]:
     """Yield the goals of played motions that a run did not reach.
 
-    A goal that a client cancelled or replaced does not count.
+    A goal that a client cancelled or replaced does not count, and neither does one that runs until a cancel
+    and ended with the run.
 
     Args:
         loop: Plan of the loop.
@@ -44,8 +45,11 @@ def find_unreached_goals(loop: LoopPlan, goals: GoalTotals, ran_ns: int) -> Iter
     planned = [report for report in goals.failed if report.origin in origins]
     for report in sorted(planned, key=lambda report: report.cut):
         name, sentence, remedy = played_name(report.origin, report.controller), report.sentence, ""
+        command = by_origin.get(report.origin)
         if report.cut:
-            sentence, remedy = _describe_end(loop, name, by_origin.get(report.origin), ran_ns)
+            if command is not None and command.goal is not None and command.goal.end_ns is None:
+                continue
+            sentence, remedy = _describe_end(loop, name, command, ran_ns)
         yield UnreachedGoal(report.controller, name, sentence, remedy, report)
     missing = Counter(command.origin for command in starts)
     missing.subtract(goals.begun)
@@ -78,6 +82,8 @@ def played_name(origin: str, controller: str) -> str:
 
 
 def motion_name(origin: str) -> str:
-    """Return the name of the motion file in an origin; empty for other origins."""
+    """Return the name of the motion file, or of a controller's own motion, in an origin; empty for other
+    origins.
+    """
     path, *place = origin.rsplit(":", 2)
     return Path(path).stem if len(place) == 2 and all(part.isdigit() for part in place) else ""

@@ -99,14 +99,14 @@ class MotionPart(msgspec.Struct, frozen=True):
     file: str
     controller: str
     start_ns: int
-    end_ns: int
-    points: int
+    end_ns: int | None  # None: it is played until it is cancelled
+    points: int  # 0 for a controller's own motion
     commands: tuple[ScheduledCommand, ...]
     mark: Mark
 
     @property
-    def motion_end_ns(self) -> int:
-        """End of the motion, when its goal is judged; at most `end_ns`."""
+    def motion_end_ns(self) -> int | None:
+        """End of the motion, when its goal is judged; at most `end_ns`, and None as that."""
         goal = self.commands[0].goal
         return self.end_ns if goal is None else goal.end_ns
 

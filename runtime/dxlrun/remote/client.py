@@ -24,6 +24,7 @@ import msgspec
 from msgspec.structs import asdict
 
 from dxlrun.channels.loop_requests import Rate, RebootRequest, Switch, TorqueRequest
+from dxlrun.compile.motion_names import PLAY, find_live_motion, is_name
 from dxlrun.errors import DxlrunError, GoalTimeout, Refused
 from dxlrun.remote import texts
 from dxlrun.remote.live.listening import MessageIterator, TopicMessage
@@ -359,9 +360,16 @@ class RemoteRobot:
     def play(self, motion: Path | str, speed: float = 1.0) -> Executed:
         """Play a motion file at `speed` times its speed; returns when its controllers have begun.
 
+        A text can also be a name, as for `dxlrun play`: of a file next to the robot file or in its folder
+        motions, or of a controller's own motion. Raises InputError for an unknown or ambiguous name.
+
         All controllers begin in one cycle, each with a goal, and first move the joints slowly to their first
         poses. Raises Refused with all problems of the file, and all reasons why the robot cannot play it.
         """
+        if isinstance(motion, str) and is_name(motion):
+            name, motion, player = find_live_motion(motion, self.name, self.info())
+            if player:
+                return self.send(player, PLAY, {"motion": name, "speed": speed})
         text = Path(motion).read_text(encoding="utf-8")
         return self._execute(requests.PLAY, body=NewMotion(text, str(motion), speed))
 

@@ -18,10 +18,8 @@ from importlib import invalidate_caches
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from dxlrun.compile.robot_compiler import compile_robot
+from dxlrun.compile.robot_compiler import compile_files
 from dxlrun.description.frames.tree import FrameTree
-from dxlrun.description.motion import read_motion
-from dxlrun.description.reading import read_robot
 from dxlrun.description.robot import robot_form
 from dxlrun.errors import InputError
 from dxlrun.log.log_reader import Log, read_log
@@ -48,10 +46,8 @@ def plan_of(
     duration_s: float | None = None,
 ) -> Plan:
     """Compile a robot file with its arguments and motions; raises InputError with all problems."""
-    description = read_robot(Path(robot), arguments or {})
-    motions = [read_motion(Path(motion), description.groups, description.omitted) for motion in play]
     duration_ns = None if duration_s is None else round(duration_s * 1e9)
-    return compile_robot(description, motions, duration_ns).plan
+    return compile_files(Path(robot), arguments or {}, list(play), duration_ns).plan
 
 
 def simulated_robot(

@@ -120,7 +120,7 @@ class GoalAction(_Message, frozen=True, tag="goal"):
 
 
 class PlayAction(_Message, frozen=True, tag="play"):
-    """Play a motion file from the directory `motions` next to the robot file."""
+    """Play a motion file from the directory `motions` next to the robot file, or a motion of a controller."""
 
     motion: str
 

@@ -167,7 +167,7 @@ class LiveRobot:
         self._urdf = robot.urdf()
         tree = robot.frames() if self._urdf else None
         self._imu, self._imu_link = (tree.imu, tree.imu_link) if tree is not None else ("", "")
-        self._motions = tuple(_motions(self._info))
+        self._motions = tuple(offered_motions(self._info))
         self._fields = {}
         self._last_event, self._known_until_s = 0, self._events[-1].time if self._events else -1.0
         self._cycle = -1
@@ -266,15 +266,17 @@ def info_of(robot: RemoteRobot) -> ViewedRobot:
     return msgspec.convert(robot.info(), ViewedRobot)
 
 
-def _motions(info: ViewedRobot) -> Iterator[str]:
-    """Yield the files `motions/*.yaml` next to the robot file that only use controllers of this robot. Files
-    that cannot be read are skipped."""
+def offered_motions(info: ViewedRobot) -> Iterator[str]:
+    """Yield the files `motions/*.yaml` next to the robot file that only use controllers of this robot, and
+    `CONTROLLER/MOTION` for motions of controllers. Files that cannot be read are skipped."""
     names = {row.name for row in info.controllers}
     for path in sorted(Path(info.file).parent.glob("motions/*.yaml")):
         with suppress(DxlrunError, OSError):
             read = read_motion(path, info.groups, info.omitted)
             if {part.controller for part in read.motion.motions} <= names:
                 yield str(path)
+    for row in info.controllers:
+        yield from (f"{row.name}/{motion}" for motion in row.motions)
 
 
 def _of_joints(states: RobotStates) -> Iterator[Values]:

@@ -32,6 +32,8 @@ class ViewedController(msgspec.Struct, frozen=True):
     """Controller that takes over when this one fails; empty without one"""
     goals: tuple[str, ...] = ()
     """Kinds of its commands that are goals, which end when they are reached"""
+    motions: Mapping[str, float | None] = {}
+    """Duration of each of its own motions, s, by name; None: until it is cancelled"""
 
 
 class ViewedRobot(msgspec.Struct, frozen=True):

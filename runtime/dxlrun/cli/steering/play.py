@@ -11,27 +11,23 @@ from cyclopts import Parameter
 from dxlrun.cli.inputs import Flag, WaitFlag
 from dxlrun.cli.steering.goals import MOST_JOINTS, begun_or_cancelled, show_goal_progress
 from dxlrun.cli.steering.steer import ONLY_ONE, RobotChoice, connect_robot, report_done
-from dxlrun.errors import DxlrunError, InputError, Mark, Problem, Refused, suggestion
+from dxlrun.compile.motion_names import (
+    PLAY,
+    FoundMotion,
+    find_live_motion,
+    has_motions,
+    is_name,
+    motion_files,
+    motions_of_players,
+)
+from dxlrun.errors import DxlrunError, InputError, Mark, Problem, Refused
 from dxlrun.output.terminal import print_warning, show_json, show_parts
 
 if TYPE_CHECKING:
     from dxlrun.description.joints.groups import Groups
     from dxlrun.remote.client import RemoteRobot
 
-PLAY = "play"
-"""Name of the command by which a controller such as keyframe_player plays one of its own motions."""
 MOST_LOOPS = 10_000
-_FOLDER = "motions"
-"""Name of the folder next to the robot file in which motion files are searched."""
-
-
-class MotionSource(NamedTuple):
-    """A motion named on the command line, and where it was found."""
-
-    motion: str
-    path: Path
-    player: str = ""
-    """Controller that has the motion; empty: `path` is the motion file."""
 
 
 class Playable(NamedTuple):
@@ -65,7 +61,8 @@ def play_motions(
     ----------
     motions
         Motion files, or names of motions. A name stands for a file next to the robot file or in its folder
-        motions, or for a motion of a keyframe_player. The controllers of a motion must be active.
+        motions, or for a motion of a controller such as a keyframe_player, also as CONTROLLER/MOTION. The
+        controllers of a motion must be active.
     speed
         Speed factor: at 0.5 a motion takes twice as long.
     loop
@@ -80,7 +77,7 @@ def play_motions(
         if listed:
             _list(robot, chosen)
             return 0
-        found = [_found(robot, motion) for motion in motions]
+        found = [find_live_motion(motion, robot.name, robot.info()) for motion in motions]
         files = [each.path for each in found if not each.player]
         if len(found) > 1 or _omitted(robot.info()):
             _check_forms(robot, files)
@@ -101,12 +98,11 @@ def _check(motions: Sequence[str], loop: int, *, listed: bool, wait: bool) -> No
     if not wait and loop * len(motions) > 1:
         raise InputError("--no-wait can start only one motion; omit --no-wait")
     for motion in motions:
-        path = Path(motion)
-        if not path.is_file() and (path.suffix or path.name != motion):
+        if not is_name(motion) and not Path(motion).is_file():
             raise InputError(f"motion file {motion} not found; check the path")
 
 
-def _play(robot: RemoteRobot, found: MotionSource, speed: float, chosen: RobotChoice, *, wait: bool) -> int:
+def _play(robot: RemoteRobot, found: FoundMotion, speed: float, chosen: RobotChoice, *, wait: bool) -> int:
     """Play one motion; return the exit code after its end, or at once without `wait`."""
     motion, path, player = found
     try:
@@ -123,60 +119,6 @@ def _play(robot: RemoteRobot, found: MotionSource, speed: float, chosen: RobotCh
         goals = f"goal{'s' if len(numbers) > 1 else ''} {shown}"
         return report_done(robot, chosen, done, f"{robot.name}: plays {motion} as {goals}")
     return show_goal_progress(robot, chosen, done, numbers, motion)
-
-
-# Lookup of motions
-
-
-def _found(robot: RemoteRobot, name: str) -> MotionSource:
-    """Return the motion file or the controller for a motion's name or path.
-
-    Raises InputError for an unknown name, or one that several files or controllers have.
-    """
-    if (path := Path(name)).is_file():
-        return MotionSource(name, path)
-    info = robot.info()
-    players = _players(info)
-    files = _files(info)
-    fitting = [file for file in files if file.stem == name]
-    having = [player for player, motions in players.items() if name in motions]
-    if len(fitting) + len(having) > 1:
-        ways = [
-            *(f"`dxlrun play {file}`" for file in fitting),
-            *(f"`dxlrun send {player} {PLAY} motion={name}`" for player in having),
-        ]
-        raise InputError(f"{len(ways)} motions have the name {name}; choose one: {', '.join(ways)}")
-    if fitting or having:
-        return MotionSource(name, fitting[0]) if fitting else MotionSource(name, Path(name), having[0])
-    known = [each.motion for each in _playable(info)]
-    raise InputError(
-        f"{robot.name} has no motion {name}, and no file has this name; {suggestion(name, known)}"
-    )
-
-
-def _players(info: Mapping[str, object]) -> dict[str, Mapping[str, float | None]]:
-    """Return controller -> motion -> duration, s, for the motions that controllers have."""
-    rows = cast("Sequence[Mapping[str, object]]", info["controllers"])
-    return {str(row["name"]): cast("Mapping[str, float | None]", row["motions"]) for row in rows}
-
-
-def _files(info: Mapping[str, object]) -> list[Path]:
-    """Return the YAML files next to the robot file and in its folder of motions, which may be motion
-    files.
-    """
-    robot = Path(str(info["file"]))
-    folders = robot.parent, robot.parent / _FOLDER
-    return [file for folder in folders for file in sorted(folder.glob("*.yaml")) if file != robot]
-
-
-def _has_motions(file: Path) -> bool:
-    """Return True when a YAML file has a line `motions:`, as motion files have; it may still be invalid."""
-    from dxlrun.description.document import read_text
-
-    try:
-        return any(line.startswith("motions:") for line in read_text(file).splitlines())
-    except InputError:
-        return False
 
 
 def _check_forms(robot: RemoteRobot, files: Sequence[Path]) -> None:
@@ -231,10 +173,10 @@ def _playable(info: Mapping[str, object]) -> Iterator[Playable]:
     rows = cast("Sequence[Mapping[str, object]]", info["controllers"])
     joints = {str(row["name"]): cast("Sequence[str]", row["joints"]) for row in rows}
     known = {joint for each in joints.values() for joint in each}
-    for player, motions in _players(info).items():
+    for player, motions in motions_of_players(info).items():
         for name, seconds in motions.items():
             yield Playable(name, (player,), joints[player], seconds)
-    for file in filter(_has_motions, _files(info)):
+    for file in filter(has_motions, motion_files(Path(str(info["file"])))):
         try:
             motion = read_motion(file, cast("Groups", info["groups"]), _omitted(info)).motion
         except InputError:

@@ -183,6 +183,11 @@ class Manager:
     # Commands
 
     @property
+    def has_played(self) -> bool:
+        """True if all commands of the plan were sent, and no goal is running."""
+        return self._next >= len(self._plan.commands) and not self._goals.running
+
+    @property
     def settles(self) -> bool:
         """True while the motion of any goal has ended but its outcome is still open."""
         return self._goals.are_settling
@@ -295,7 +300,7 @@ class Manager:
         ):
             goal = self._pursued[name] = self._accept(managed, command.kind, command.origin)
             managed.adopt_goal(goal)
-            part = PlayedPart(name, command.kind, (), (), planned.end_ns, planned.positions)
+            part = PlayedPart(name, command.kind, (), (), planned.end_ns or 0, planned.positions)
             self._motions[name] = PlayedMotion(goal, part, (), 0)
         return self._pursued.get(name)
 
