@@ -49,7 +49,9 @@ SHARED_CLASSES = {
     "PositionsCommand": "title in the schema of a command",
 }
 SHARED_MODULES = {
-    **dict.fromkeys(("compile", "form", "plan", "runtime", "safe", "servos", "table"), FEATURE),
+    **dict.fromkeys(
+        ("compile", "form", "plan", "runtime", "safe", "servo_key", "servos", "settings", "table"), FEATURE
+    ),
     "texts": "one table of texts for each room",
     **dict.fromkeys(("plugin", "hatch_build", "__init__", "__main__"), "fixed name in a package"),
 }
