@@ -60,6 +60,7 @@ class ServoConfig(msgspec.Struct, frozen=True):
     motor: MotorModel | None = None
     """Parameters of the servo's motor from a motor file; None: the simulation's default for the servo
     model."""
+    homing_offset: int = 0  # Initial value of Homing Offset, ticks
 
 
 class DeviceReadings(msgspec.Struct, frozen=True):

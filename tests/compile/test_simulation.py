@@ -15,6 +15,7 @@ from dxlrun.compile.robot_compiler import compile_files
 from dxlrun.compile.simulation import simulation_of
 from dxlrun.errors import InputError
 from dxlrun.plan.mechanics_plan import CouplingPlan, MechanicsPlan
+from dxlrun.run.virtual_run import VirtualRobot
 from dxlsim.simulation_plan import Load, Mechanism, MechanismServo, UrdfBodies
 
 URDF = """<robot name="pair"><link name="body"/><link name="left"/><link name="right"/>
@@ -131,3 +132,22 @@ def test_package_of_physics_runs_where_servos_are_simulated() -> None:
     assert simulated["dxlrun_mujoco"] == "dxlrun"
     real = compile_files(robot, {"port": "/dev/ttyUSB0"}, []).plan.packages
     assert set(simulated) - set(real) == {"dxlrun_mujoco"}
+
+
+def test_simulated_servo_has_the_homing_offset_of_the_robot_file() -> None:
+    joint = (
+        "{bus: main, model: XM430-W350, reference: 200 deg, direction: -1, limits: {velocity: 3 rad/s}, "
+        "simulation: {gravity: 0.4 Nm, gravity_angle: 30 deg}"
+    )
+    plan = compile_text(
+        "name: two\nbuses: {main: {port: sim, protocol: 2.0, baud_rate: 1_000_000}}\nloop: {rate: 50}\n"
+        f"joints: {{a: {joint}, id: 1}}, b: {joint}, id: 2, homing_offset: -700}}}}\n"
+        "controllers: {arm: {type: joint_group_position_controller, joints: [a, b]}}\n",
+        duration_ns=1_000_000_000,
+    ).plan
+    robot = VirtualRobot(plan)
+    assert robot.run().reason == "ended"
+    first, second = robot.buses[0].servos
+    assert second.registers.ticks("homing_offset") == -700
+    assert second.shaft_angle == pytest.approx(first.shaft_angle, abs=1e-4), "the load pulls as much"
+    assert first.shaft_angle == pytest.approx(math.radians(200), abs=0.05)

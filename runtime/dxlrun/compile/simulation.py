@@ -246,7 +246,7 @@ def _mechanism(
     matrix: tuple[tuple[float, ...], ...] = ((1.0,),),
     loads: tuple[Load, ...] = (),
 ) -> Mechanism:
-    parts = (MechanismServo(index, one.reference, one.direction * one.ratio) for index, one in servos)
+    parts = (MechanismServo(index, one.encoder_reference, one.direction * one.ratio) for index, one in servos)
     return Mechanism(tuple(parts), joints, matrix, loads, TYPES[servos[0][1].unit])
 
 
@@ -265,12 +265,13 @@ def _simulated_bus(plan: Plan, bus: BusPlan) -> BusConfig:
             ServoConfig(
                 servo.servo_id,
                 servo.model,
-                servo.reference,
+                servo.encoder_reference,
                 bus.return_delay_ns,
                 # The load on several servos belongs to their mechanism.
                 load=_felt(servo, described.loads.get(servo.joint)) if servo.row in own else NO_LOAD,
                 times=described.times.get(servo.own_name, ServoTimes()),
                 motor=described.motors.get(servo.own_name),
+                homing_offset=servo.homing_offset or 0,
             )
             for servo in bus.servos
         ),
@@ -294,5 +295,5 @@ def _felt(servo: ServoPlan, load: Load | None) -> Load:
         return Load(inertia, friction, steady=servo.direction * (load.steady * servo.ratio))
     if not load.gravity:
         return Load(inertia, friction)
-    down = servo.reference + servo.direction * load.gravity_angle / servo.ratio
+    down = servo.encoder_reference + servo.direction * load.gravity_angle / servo.ratio
     return Load(inertia, friction, load.gravity * servo.ratio, down, turns=servo.ratio)

@@ -50,6 +50,8 @@ def make_servo(
     servo.write_time_ns = config.times.write_time_ns
     memory["id"] = config.servo_id
     memory[baud_item(memory)] = baud_value(table, baud_rate)
+    if config.homing_offset:
+        memory["homing_offset"] = config.homing_offset
     memory["return_delay_time"] = min(254, round(config.return_delay_ns / 2000))
     servo.power_up()
     shaft.response_delay_ns = config.times.response_delay_ns

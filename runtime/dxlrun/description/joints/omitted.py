@@ -26,6 +26,8 @@ _SINGLE = ("joint", "leader")
 """Keys that name one joint, without which the mapping that has the key cannot exist."""
 _RESCUERS = ("fallback", "activate")
 """Keys of a controller that name those that take over from it, or protect the robot at its command."""
+_OTHERS = ("into", *_RESCUERS)
+"""Keys of a controller whose list names controllers."""
 _CONTROLLERS, _POLICIES, _POSES, _BUSES = "controllers", "policies", "poses", "buses"
 _Value = TypeVar("_Value")
 
@@ -75,7 +77,9 @@ def omit_joints(grown: PlainDocument, without: Sequence[str]) -> Omission:
     remark = Problem(mark, what, f"{fix} to run with {it}", severity="warning")
     left = _mapping(reduced.data.get("groups"))
     return Omission(
-        replace(reduced, problems=problems), (*out, *(name for name in groups if name not in left)), (remark,)
+        replace(reduced, problems=problems),
+        (*out, *(name for name in groups if name not in left)),
+        (remark, *_uneven(grown, reduced, remover.uneven)),
     )
 
 
@@ -108,6 +112,8 @@ class _Remover:
         """Entries of sections that are omitted with the joints, such as `controller gripper`."""
         self.changed: list[str] = []
         """Entries of sections that continue without the joints, such as `controller arm`."""
+        self.uneven: list[KeyPath] = []
+        """Lists of controllers that are as long as their list `joints` was, so they may be in its order."""
 
     def reduced(self, grown: PlainDocument) -> PlainDocument:
         """Return the document without the joints."""
@@ -147,6 +153,12 @@ class _Remover:
             return None
         of_entries = len(path) == 1 or path == (_POLICIES, "groups")
         by_joint = self._is_by_joint(value, path)
+        if path[:1] == (_CONTROLLERS,) and self._out.intersection(joints := _list(value.get("joints"))):
+            self.uneven += [
+                (*path, key)
+                for key, item in value.items()
+                if isinstance(item, list) and len(item) == len(joints) and key not in (*_LISTS, *_OTHERS)
+            ]
         result: dict[str, object] = {}
         for key, item in value.items():
             if by_joint and key in self._out:
@@ -241,6 +253,15 @@ def _missed(grown: PlainDocument, reduced: PlainDocument) -> Iterator[Problem]:
                     mark = grown.marks.value(_CONTROLLERS, name, key)
                     what = f"{key} of {name} names {other}, which is omitted with its joints"
                     yield Problem(mark, what, "name another controller")
+
+
+def _uneven(grown: PlainDocument, reduced: PlainDocument, lists: Sequence[KeyPath]) -> Iterator[Problem]:
+    """Yield a warning for each list that may have one value for each joint, also for those omitted."""
+    for _, name, *rest in lists:
+        if name in _mapping(reduced.data.get(_CONTROLLERS)):
+            what = f"{rest[-1]} of {name} is as long as its list joints was, and is not shortened"
+            fix = "if it has a value for each joint, write it as a mapping by joint"
+            yield Problem(grown.marks.key(_CONTROLLERS, name, *rest), what, fix, severity="warning")
 
 
 def _is_emptied(item: object, kept: object) -> bool:
