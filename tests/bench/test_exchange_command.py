@@ -21,7 +21,10 @@ FOLDER = Path(__file__).parents[2] / "bench" / "exchange"
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (("--peers", "ours,theirs"), "--peers: there is no theirs; there are ours, polled, unrecorded, sdk"),
+        (
+            ("--peers", "ours,theirs"),
+            "--peers: there is no theirs; there are ours, polled, unrecorded, bus",
+        ),
         (("--peers", ""), "--peers is empty; there are ours"),
         (("--protocol", "3.0"), "--protocol: there is no 3.0; there are 1.0, 2.0"),
         (("--against", "nothing"), "--against: there is no nothing; there are canned, simulated"),

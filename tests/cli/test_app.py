@@ -69,7 +69,7 @@ def test_value_may_hold_the_sign() -> None:
 def test_every_error_is_a_sentence_and_an_exit_code(
     dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch, error: BaseException, code: int, says: str
 ) -> None:
-    def fail(*_: object) -> NoReturn:
+    def fail(*_: object, **__: object) -> NoReturn:
         raise error
 
     monkeypatch.setattr("dxlrun.cli.check.compiled", fail)

@@ -117,7 +117,8 @@ def steered(tmp_path_factory, runs, place):
     robot.stop()
     run.stopped = run.running.log()  # at once: `stop` returns when the log is closed
     run.finish()
-    return run
+    yield run
+    run.robot.close()
 
 
 def test_a_steered_run_ends_well_when_its_client_stops_it(steered, place):

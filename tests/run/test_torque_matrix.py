@@ -38,6 +38,7 @@ from dxlrun.plan.policy_plan import SLOW_SPEED
 from dxlrun.plan.robot_plan import Plan
 from dxlrun.remote.preparation import Preparation
 from dxlrun.testing import Log, VirtualRobot, plan_of, read_log
+from dxlrun_controllers.plugin import dxlrun_controllers
 from dxlsim.bus.simulated_bus import SimulatedBus
 from dxlsim.faults.fault import parse_fault
 from dxlsim.faults.script import FaultScript
@@ -121,8 +122,8 @@ def _steered(index: int, case: Case, joints: tuple[str, ...]) -> Steered:
 
 
 def test_every_standard_controller_is_in_the_matrix():
-    """A new type fails here until `tests.kit.laws` has a case for it."""
-    assert {one.case.type for one in steered()} | WITHOUT_JOINTS == set(load_plugins().controllers)
+    """A new standard type fails here until `tests.kit.laws` has a case for it."""
+    assert {one.case.type for one in steered()} | WITHOUT_JOINTS == set(dxlrun_controllers())
     assert all(
         not one.controller.interfaces(one.controller.Parameters.model_validate(one.keys), ("x", "y")).command
         for one in cases(("x", "y"))

@@ -38,7 +38,7 @@ def tracking(
     robot: str | None = None,
     /,
     *assignments: Assignment,
-    play: Path | None = None,
+    play: str | None = None,
     setups: str = _NAMES,
     stress: StressFlag = True,
     report: Path | None = None,
@@ -55,7 +55,7 @@ def tracking(
     robot
         Robot file. Default: single_joint.yaml of `dxlrun examples`.
     play
-        Motion file to play, of one joint. Default: the tracking motion of single_joint.yaml, 30 s.
+        Motion file, of one joint. Default: the tracking motion of single_joint.yaml, 30 s.
     setups
         Set-ups to measure, separated by commas.
     stress
@@ -69,7 +69,7 @@ def tracking(
     if report is not None:
         check_report(report)
     file = examples_directory() / "single_joint.yaml" if robot is None else Path(robot)
-    motion = play or examples_directory() / "motions" / "single_joint_tracking.yaml"
+    motion = Path(play) if play else examples_directory() / "motions" / "single_joint_tracking.yaml"
     if robot is None or play is None:
         given = {word.partition(":=")[0] for word in words}
         words += [word for word in _ACTIVE if word.partition(":=")[0] not in given]

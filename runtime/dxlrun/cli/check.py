@@ -57,7 +57,7 @@ def check_robot(
     Parameters
     ----------
     play
-        Motion file, or name of a motion, to check together with the robot file. Can be given several times.
+        Motion file, or name of a motion as for `dxlrun play`. Can be given several times.
     duration
         Duration of the run, s, or with a unit: 500ms, 2min.
     online

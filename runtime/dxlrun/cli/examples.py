@@ -131,7 +131,9 @@ def _example(path: Path) -> Example:
 
 
 def _fits(motion: MotionDescription, robot: Robot) -> bool:
-    """Return True when a robot has all controllers and joints that a motion names."""
+    """Return True when a robot has all controllers and joints that a motion names, and they can play it."""
+    from dxlrun.compile.motions import command_kind
+    from dxlrun.control.controllers.plugin_loading import load_plugins
     from dxlrun.description.motion import FormulaPart
 
     joints: set[str] = set()
@@ -141,7 +143,10 @@ def _fits(motion: MotionDescription, robot: Robot) -> bool:
         else:
             joints.update(*(point.joints for point in part.points))
     controllers = {part.controller for part in motion.motion.motions}
-    return controllers <= set(robot.controllers) and joints <= set(robot.joints)
+    if not (controllers <= set(robot.controllers) and joints <= set(robot.joints)):
+        return False
+    offers = (load_plugins().controllers.get(robot.controllers[name].type) for name in controllers)
+    return all(offer is None or command_kind(offer.controller) for offer in offers)
 
 
 def _about(text: str) -> str:
