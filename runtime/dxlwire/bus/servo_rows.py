@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
 
@@ -129,8 +130,9 @@ class WrittenRows:
             raise TypeError(f"this writer takes {self._count} values, one for each item; got {len(values)}")
         for row, value in enumerate(values):
             self._goals[row] = value
-        if self._count > 1:  # Half of a servo's values would be sent with zeros or old ones for the rest
-            goals = self._goals[: self._count]
+        goals = self._goals[: self._count]
+        if self._count > 1 and math.isnan(goals.sum()):  # Quicker than to look at each goal
+            # Half of a servo's values would be sent with zeros or old ones for the rest
             goals[:, np.isnan(goals).any(axis=0)] = np.nan
         self.send_goals()
 
