@@ -101,12 +101,12 @@ class Chain:
             x += a * u + d * v + g * w
             y += b * u + e * v + h * w
             z += c * u + f * v + i * w
-            k, l, m, n, o, p, r, s, t = step.rotation  # noqa: E741  the letters of a matrix
+            k, q, m, n, o, p, r, s, t = step.rotation
             # The joint's frame in the base; its third column is the joint's axis.
             a, b, c, d, e, f, g, h, i = (
-                a * k + d * l + g * m,
-                b * k + e * l + h * m,
-                c * k + f * l + i * m,
+                a * k + d * q + g * m,
+                b * k + e * q + h * m,
+                c * k + f * q + i * m,
                 a * n + d * o + g * p,
                 b * n + e * o + h * p,
                 c * n + f * o + i * p,

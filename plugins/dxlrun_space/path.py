@@ -50,7 +50,7 @@ class MotionLimits(msgspec.Struct, frozen=True):
 
 
 class NoPath(msgspec.Struct, frozen=True):
-    """The reason why there is no path, as text with the distance that is left."""
+    """Failure to find a path: the reason as text, with the remaining distance."""
 
     text: str
 

@@ -280,9 +280,9 @@ def normal_matrix(columns: Sequence[Column], weight: float, damping: float) -> l
     """Return the lower triangle of J^T W J + damping, with a weight, m^2/rad^2, for the orientation."""
     rows: list[list[float]] = []
     for index, (a, b, c, d, e, f) in enumerate(columns):
-        d, e, f = d * weight, e * weight, f * weight  # noqa: PLW2901  weighted once a row
+        g, h, i = d * weight, e * weight, f * weight
         rows.append(
-            [a * u + b * v + c * w + d * x + e * y + f * z for u, v, w, x, y, z in columns[: index + 1]]
+            [a * u + b * v + c * w + g * x + h * y + i * z for u, v, w, x, y, z in columns[: index + 1]]
         )
         rows[index][index] += damping
     return rows

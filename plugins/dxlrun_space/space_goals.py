@@ -136,8 +136,8 @@ class PoseGoal(msgspec.Struct, frozen=True):
     def target(self, frame: Pose, tip: Pose) -> Pose:
         """Return the goal pose in the base from the poses of the frame and of the tip at the start."""
         back = inverted(frame[0])
-        x, y, z = turned(back, tuple(a - b for a, b in zip(tip[1], frame[1], strict=True)))  # type: ignore[arg-type]  # three of three
-        present = x, y, z
+        x, y, z = (a - b for a, b in zip(tip[1], frame[1], strict=True))
+        present = turned(back, (x, y, z))
         place = tuple(
             (now if math.isnan(goal) else goal) + way
             for now, goal, way in zip(present, self.place, self.way, strict=True)

@@ -61,6 +61,13 @@ def test_servos_that_are_as_declared_are_counted(check):
     assert (code, err) == (0, "")
 
 
+def test_each_servo_of_a_joint_is_counted(check):
+    wrist = ROBOT.splitlines()[-1]
+    two = ROBOT.replace(f"{wrist}\n", "").replace("id: 1, ", "servos: [{id: 1}, {id: 2}], ")
+    _, out, err, _ = check("position_p_gain: 800", robot_text=two)
+    assert "2 servos compared with the file, no differences\n" in out, err
+
+
 @pytest.mark.parametrize(("limit", "tighter"), [("4 A", True), ("0.9 A", False)])
 def test_a_register_that_is_tighter_than_the_file_is_reported(check, limit, tighter):
     written = ROBOT.replace("registers: {REG", f"limits: {{effort: {limit}}}, registers: {{REG")

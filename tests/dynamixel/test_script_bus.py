@@ -82,7 +82,7 @@ def test_servos_that_are_absent_or_of_another_model_are_refused(script):
     assert str(caught.value).splitlines()[0] == "ID 2 on line is XM430-W350, not XL430-W250"
     with pytest.raises(LookupError, match="known models"):
         script.bus.servos({1: "SG90"})
-    with pytest.raises(ValueError, match="ID 254: there are 0 to 252"):
+    with pytest.raises(ValueError, match="ID 254 does not exist; IDs are 0 to 252"):
         script.bus.servos({254: "XM430-W350"})
 
 
@@ -516,7 +516,7 @@ def test_threads_share_a_bus_and_the_event_loop_waits_for_real_lines():
                 return (await servos.reader("present_position")()).valid.all()
 
         assert asyncio.run(work())
-    with pytest.raises(ValueError, match=r"protocol 3: there are 1.0 and 2.0"):
+    with pytest.raises(ValueError, match=r"protocol 3 is unknown; use 1.0 or 2.0"):
         Bus("/dev/null", protocol=3)
 
 

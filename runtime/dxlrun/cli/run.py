@@ -108,7 +108,7 @@ def run(
     endless = next((part for part in result.parts if part.end_ns is None), None)
     if virtual and duration is None and endless is not None:
         raise InputError(
-            f"{endless.file} is played until it is cancelled, which nobody does on virtual time; give "
+            f"{endless.file} loops until a cancel, and a run on virtual time cannot be cancelled; give "
             "--duration SECONDS"
         )
     if ledger is not None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -25,20 +26,20 @@ from dxlwire.exchange.bus_engine import NEVER
 from dxlwire.transaction import Program, ProgramJob, Result
 
 
-class _Waiting:
+class _Waiting(ABC):
     """A session whose replies an asyncio program awaits, one call at a time; base class of two ways."""
 
     def __init__(self, session: Session | SdkSession) -> None:
         self.session = session
         self.lock = asyncio.Lock()
 
+    @abstractmethod
     async def run_program(self, program: Program[Result]) -> Result:
         """Run a program to its end and return its result. Raises PortError if the line is closed or lost."""
-        raise NotImplementedError
 
+    @abstractmethod
     async def read_servos(self, reading: Reading | SdkReading) -> None:
         """Read every item of a reader once. Raises PortError if the line is closed or lost."""
-        raise NotImplementedError
 
 
 class _InEventLoop(_Waiting):

@@ -38,7 +38,7 @@ class Bus:
 
         Raises:
             PortError: The port cannot be opened, or the adapter does not support the baud rate.
-            ValueError: There is no such protocol.
+            ValueError: The protocol is unknown.
         """
         self._session = open_session(port, baud_rate, protocol)
         self._limp_at_exit = limp_at_exit
@@ -86,7 +86,7 @@ class Bus:
         """Find the servos that answer at this baud rate, in the order of their IDs; None: all IDs.
 
         Raises:
-            ServoError: There is no control table for a servo.
+            ServoError: A servo has an unknown model.
         """
         session = self._session
         looked_for = range(session.line.dialect.HIGHEST_ID + 1) if ids is None else ids
@@ -100,7 +100,7 @@ class Bus:
 
         Raises:
             ServoError: A servo does not answer, or has another model.
-            LookupError: There is no such model.
+            LookupError: A model is unknown.
         """
         return self._use(self._session.run_program(named_servos(self._session, models)))
 
@@ -151,7 +151,7 @@ class ServoSet:
             raw: Integers of the wire instead of SI units.
 
         Raises:
-            ServoError: ServoSet did not answer, three times each.
+            ServoError: Servos did not answer, three times each.
             LookupError: A model has no such item.
         """
         values, failures = self._session.run_program(self._group.read_values(item, raw=raw))
@@ -168,7 +168,7 @@ class ServoSet:
             raw: The values are integers of the wire instead of SI units.
 
         Raises:
-            ServoError: ServoSet did not answer, refused, or have torque.
+            ServoError: Servos did not answer, refused, or have torque.
             ValueError: A value is outside the range of the item.
             LookupError: A model has no such item.
         """

@@ -12,8 +12,6 @@ from dxlwire.plan.mode_plan import mode_numbers, position_reach
 
 MODE_ITEMS = ("operating_mode", "control_mode")
 """Items whose values have names: `position`, `wheel`."""
-
-
 _POSITIONS = ("goal_position", "present_position")
 
 
@@ -76,10 +74,10 @@ def ticks_of(table: ControlTable, item: ControlItem, value: float | str, *, raw:
 
 
 def nearest_ticks(item: ControlItem, value: float, *, raw: bool) -> int:
-    """Return the signed number of ticks that is nearest to a value, within the range of the item; NaN: 0."""
+    """Return the signed number of ticks that is nearest to a value, within the range of the item."""
     exact = value if raw else (value - item.offset) / item.scale
     lowest, highest = tick_range(item)
-    return round(min(max(exact, lowest), highest)) if exact == exact else max(lowest, 0)  # noqa: PLR0124  NaN
+    return round(min(max(exact, lowest), highest))
 
 
 def value_in(item: ControlItem, data: bytes | memoryview, *, raw: bool) -> float:

@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 
 from dxlwire.bus.item_values import item_of, tick_range
 from dxlwire.bus.programs import Addressed
-from dxlwire.bus.servo_rows import ReadRows, ServoRows, WrittenRows, blocks_of, writable_item
+from dxlwire.bus.servo_rows import ReadRows, ServoRows, WrittenRows, writable_item
 from dxlwire.bus.session import Session
 from dxlwire.bus_plan import BusPlan, DevicePlan, GoalLayout, members_of
 from dxlwire.control_table import ControlItem
+from dxlwire.control_table.control_items import side_by_side
 from dxlwire.exchange.arrays import Floats
 from dxlwire.exchange.cyclic_exchange import CyclicExchange
 from dxlwire.exchange.cyclic_reads import CyclicReads
@@ -198,7 +199,7 @@ def _sync_writes(
     """Return the sync writes of these items: one for each block of adjacent items, and for each layout."""
     groups: dict[tuple[GoalLayout, tuple[str, ...]], list[int]] = {}
     for row, servo in enumerate(servos):
-        for block in blocks_of([writable_item(servo, name) for name in items]):
+        for block in side_by_side(writable_item(servo, name) for name in items):
             length = block[-1].address + block[-1].size - block[0].address
             layout = GoalLayout(block[0].address, length)
             groups.setdefault((layout, tuple(item.name for item in block)), []).append(row)

@@ -5,37 +5,29 @@ acknowledgement the item is read back, which shows whether the servo has execute
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import msgspec
 from msgspec.structs import replace
 
-from dxlwire.bus_plan import Field, ModePlan
 from dxlwire.control_table import ControlItem, ControlTable, models_by_number
 from dxlwire.exceptions import FailureKind, ServoFailure
-from dxlwire.exchange.goal_writes import LEADS
-from dxlwire.modes import Mode
 from dxlwire.plan.bus_watchdog import MOST_TICKS
-from dxlwire.plan.line import Line, listen_transaction
+from dxlwire.plan.line import MOST_SPARE, Line, listen_transaction
 from dxlwire.plan.mode_plan import in_mode, mode_plans
 from dxlwire.plan.retry import ATTEMPTS, retry
 from dxlwire.transaction import BROADCAST_ID, Program, Reply, TransactionOutcome
 
-SHORT_TIMEOUT_NS = 3_000_000
+SHORT_TIMEOUT_NS = 2_000_000
 """Time (ns) that a ping which is probably not answered waits, beyond the latest arrival by the wire."""
 SLOT_NS = 3_000_000
 """Time (ns) for each ID after a broadcast ping, in addition to the bytes of its answer (dynamixel-sdk,
 broadcastPing)."""
+IDENTITY_LENGTH = 3
+"""Bytes that identify a node, model number (2) and firmware version (1): the reply to a ping of Protocol 2.0,
+bytes 0..2 of the table in 1.0."""
 USE_TORQUE = "use `servos.torque = True`, which first sets the goal to the present position"
-_FIELDS: Mapping[str, str] = {"position": "position", "velocity": "speed", "effort": "effort", "pwm": "pwm"}
 _LIMITS = ("min_position_limit", "max_position_limit", "cw_angle_limit", "ccw_angle_limit")
-_MODE_REGISTERS = (
-    "operating_mode",
-    "control_mode",
-    "cw_angle_limit",
-    "ccw_angle_limit",
-    "torque_ctrl_mode_enable",
-)
 
 
 class Addressed(msgspec.Struct, frozen=True):
@@ -82,6 +74,15 @@ def find_ids(line: Line, ids: Sequence[int], answered: set[int]) -> Program[list
     return sorted(answered & set(ids))
 
 
+def identity(line: Line, servo_id: int) -> Program[tuple[Reply, Reply]]:
+    """Ping a servo; return the reply to the ping, and the reply that contains model number and firmware
+    version."""
+    ping = yield from retry(line.ping(servo_id))
+    if not ping.answered or line.dialect.PING_LENGTH >= IDENTITY_LENGTH:
+        return ping, ping
+    return ping, (yield from retry(line.read_range(servo_id, 0, IDENTITY_LENGTH, MOST_SPARE)))
+
+
 def identify(
     line: Line, models: Mapping[int, ControlTable | None]
 ) -> Program[tuple[list[Addressed], Failures]]:
@@ -94,10 +95,7 @@ def identify(
     found: list[Addressed] = []
     failures: Failures = {}
     for servo_id, expected in models.items():
-        ping = yield from retry(line.ping(servo_id))
-        reply = ping
-        if ping.answered and line.dialect.PROTOCOL == 1.0:
-            reply = yield from retry(line.read_range(servo_id, 0, 3))
+        ping, reply = yield from identity(line, servo_id)
         if not reply.answered:
             asked = "the ping" if reply is ping else "the read of its model"
             failures[servo_id] = yield from _with_level(line, servo_id, failure_of(line, reply, asked))
@@ -110,7 +108,7 @@ def identify(
             continue
         table = expected or next(iter(models_by_number(number, line.dialect.PROTOCOL, firmware)), None)
         if table is None:
-            text = f"has the model number {number}, for which there is no control table"
+            text = f"has the unknown model number {number}; add its control table with a plug-in"
             failures[servo_id] = ServoFailure("unknown_model", text)
             continue
         known = table.with_firmware(firmware)
@@ -193,23 +191,32 @@ def switch_torque(line: Line, servo: Addressed, on: bool) -> Program[None]:
 
 def _reset_goal(line: Line, servo: Addressed) -> Program[None]:
     items = servo.table.items
-    found: dict[str, int] = {}
-    for name in _MODE_REGISTERS:
-        if (item := items.get(name)) is not None:
-            found[name] = item.integer((yield from read_item(line, servo.servo_id, item)))
-    plan = _mode_in(servo.table, found)
-    lead = "position" if plan is None else LEADS.get(plan.mode, "position")
-    if plan is None or lead == "position":
-        position = yield from read_item(line, servo.servo_id, items["present_position"])
-        try:
-            # This write switches torque on in Protocol 1.0.
-            yield from write_item(line, servo, items["goal_position"], position)
-        except ServoFailed as error:
-            raise ServoFailed((yield from _with_limits(line, servo, position, error.failure))) from None
+    goal = yield from _leading_goal(line, servo)
+    if goal.name != "goal_position":
+        yield from write_item(line, servo, goal, bytes(goal.size))
         return
-    address, place = _lead_field(plan, lead)
-    goal = next(item for item in items.values() if item.address == address + place.offset)
-    yield from write_item(line, servo, goal, bytes(goal.size))
+    position = yield from read_item(line, servo.servo_id, items["present_position"])
+    try:
+        # This write switches torque on in Protocol 1.0.
+        yield from write_item(line, servo, goal, position)
+    except ServoFailed as error:
+        raise ServoFailed((yield from _with_limits(line, servo, position, error.failure))) from None
+
+
+def _leading_goal(line: Line, servo: Addressed) -> Program[ControlItem]:
+    """Return the goal that a servo follows in its present mode. It is the goal position in extended position
+    control, which needs no plan."""
+    items = servo.table.items
+    modes = mode_plans(servo.table, servo.table.min_tick, servo.table.max_tick, continuous=False)
+    found: dict[str, int] = {}
+    for name in dict.fromkeys(register.name for mode in modes for register in mode.operating):
+        found[name] = items[name].integer((yield from read_item(line, servo.servo_id, items[name])))
+    for mode in modes:
+        if in_mode(mode, found):
+            layout = mode.goals[-1]
+            address = layout.address + layout.leading.offset
+            return next(item for item in items.values() if item.address == address)
+    return items["goal_position"]
 
 
 def _with_limits(
@@ -229,21 +236,6 @@ def _with_limits(
     text = f"is at {present:.3f} rad, outside its limits {min(limits):.3f} to {max(limits):.3f} rad"
     names = " and ".join(item.title for item in ends)
     return ServoFailure(failure.kind, f"{text}, so torque stays off; turn it by hand, or change {names}")
-
-
-def _mode_in(table: ControlTable, found: Mapping[str, int]) -> ModePlan | None:
-    """Return the mode that registers select; None for extended position control, or an unknown mode."""
-    plans: Iterable[ModePlan] = mode_plans(table, table.min_tick, table.max_tick, False)
-    return next((plan for plan in plans if in_mode(plan, found) and plan.mode is not Mode.UNKNOWN), None)
-
-
-def _lead_field(plan: ModePlan, lead: str) -> tuple[int, Field]:
-    """Return the address of the block with a mode's leading goal, and the field of the goal in it."""
-    for layout in plan.goals:
-        place: Field | None = getattr(layout, _FIELDS[lead])
-        if place is not None:
-            return layout.address, place
-    raise LookupError(f"mode {plan.mode.name} has no goal {lead}")
 
 
 def failure_of(line: Line, reply: Reply, request: str) -> ServoFailure:

@@ -8,8 +8,10 @@ import numpy as np
 
 from dxlwire.bus.item_values import item_of, nearest_ticks, value_in
 from dxlwire.bus.programs import Addressed
-from dxlwire.bus.servo_rows import ReadRows, WrittenRows, blocks_of, writable_item
+from dxlwire.bus.servo_rows import ReadRows, WrittenRows, writable_item
 from dxlwire.bus.session import SdkSession
+from dxlwire.control_table import ControlItem
+from dxlwire.control_table.control_items import side_by_side
 from dxlwire.transaction import Program
 from dxlwire.wire.dialect import sync_writes
 
@@ -25,7 +27,7 @@ class SdkReading(ReadRows):
         super().__init__(session, servos, items)
         self._session = session
         self._raw = raw
-        self._blocks = [blocks_of(item_of(servo.table, name) for name in items) for servo in servos]
+        self._blocks = [side_by_side(item_of(servo.table, name) for name in items) for servo in servos]
         self._at_ns = [-1] * len(servos)
 
     def read_servos(self) -> None:
@@ -65,8 +67,10 @@ class SdkWriting(WrittenRows):
     ) -> None:
         super().__init__(session, servos, items)
         self._session = session
-        self._items = [[(writable_item(servo, name), raw) for name in items] for servo in servos]
+        self._raw = raw
+        self._rows = {name: row for row, name in enumerate(items)}
         self._ids = [servo.servo_id for servo in servos]
+        self._blocks = [side_by_side(writable_item(servo, name) for name in items) for servo in servos]
 
     def send_goals(self) -> None:
         """Send the goals. Raises PortError if the line is closed or lost."""
@@ -74,18 +78,15 @@ class SdkWriting(WrittenRows):
 
     def _send_all(self) -> Program[bool]:
         writes = [
-            (servo_id, block[0].address, b"".join(item.encode(ticks[item.name]) for item in block))
-            for row, (servo_id, items) in enumerate(zip(self._ids, self._items, strict=True))
-            if not np.isnan(self._goals[0, row])
-            for ticks in (self._ticks(row),)
-            for block in blocks_of([item for item, _ in items])
+            (servo_id, block[0].address, b"".join(self._encoded(item, column) for item in block))
+            for column, (servo_id, blocks) in enumerate(zip(self._ids, self._blocks, strict=True))
+            if not np.isnan(self._goals[0, column])
+            for block in blocks
         ]
         for packet in sync_writes(self._session.line.dialect, writes):
             yield self._session.line.unanswered(packet)
         return True
 
-    def _ticks(self, row: int) -> dict[str, int]:
-        return {
-            item.name: nearest_ticks(item, float(goal), raw=raw)
-            for (item, raw), goal in zip(self._items[row], self._goals[:, row], strict=False)
-        }
+    def _encoded(self, item: ControlItem, column: int) -> bytes:
+        goal = float(self._goals[self._rows[item.name], column])
+        return item.encode(nearest_ticks(item, goal, raw=self._raw))

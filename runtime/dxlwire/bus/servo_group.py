@@ -157,13 +157,13 @@ def named_servos(
     """Return the program that identifies servos of known models.
 
     Raises:
-        LookupError: There is no such model of this protocol.
+        LookupError: A model is unknown in this protocol.
         ValueError: No servo is named, or an ID does not exist in the protocol.
     """
     if not models:
         raise ValueError("name at least one servo")
     for servo_id in models:
         if not 0 <= servo_id <= session.line.dialect.HIGHEST_ID:
-            raise ValueError(f"ID {servo_id}: there are 0 to {session.line.dialect.HIGHEST_ID}")
+            raise ValueError(f"ID {servo_id} does not exist; IDs are 0 to {session.line.dialect.HIGHEST_ID}")
     protocol = session.plan.protocol
     return identify(session.line, {each: find_table(model, protocol) for each, model in models.items()})

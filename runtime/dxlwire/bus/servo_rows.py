@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
-from itertools import pairwise
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
 
 import msgspec
 import numpy as np
@@ -71,7 +71,7 @@ class ServoRows(msgspec.Struct):
     age_ns: NDArray[np.int64]
 
 
-class ReadRows:
+class ReadRows(ABC):
     """Values of the servos of a reader, filled by one of the two exchanges; base class of these."""
 
     def __init__(self, session: OpenLine, servos: Sequence[Addressed], items: Sequence[str]) -> None:
@@ -88,18 +88,18 @@ class ReadRows:
             self._values.reshape(-1), np.zeros(count, np.bool_), np.full(count, -1, np.int64)
         )
 
+    @abstractmethod
     def read_servos(self) -> None:
         """Read every item of every servo once.
 
         Raises:
             PortError: The line is closed or lost.
         """
-        raise NotImplementedError
 
     @property
+    @abstractmethod
     def read_by(self) -> str:
         """Instructions of one call in the e-Manual's words."""
-        raise NotImplementedError
 
     def newest_state(self) -> ServoStates:
         """Return the values of the newest cycle."""
@@ -109,7 +109,7 @@ class ReadRows:
         )
 
 
-class WrittenRows:
+class WrittenRows(ABC):
     """Goals of one writer, sent by one of the two exchanges; base class of these."""
 
     def __init__(self, session: OpenLine, servos: Sequence[Addressed], items: Sequence[str]) -> None:
@@ -136,9 +136,9 @@ class WrittenRows:
             goals[:, np.isnan(goals).any(axis=0)] = np.nan
         self.send_goals()
 
+    @abstractmethod
     def send_goals(self) -> None:
         """Send the goals. Raises PortError if the line is closed or lost."""
-        raise NotImplementedError
 
 
 def check_different(items: Sequence[str]) -> None:
@@ -164,15 +164,3 @@ def writable_item(servo: Addressed, name: str) -> ControlItem:
     if item.name == "torque_enable":
         raise ValueError(USE_TORQUE)
     return item
-
-
-def blocks_of(items: Iterable[ControlItem]) -> list[list[ControlItem]]:
-    """Return the items in blocks of adjacent addresses."""
-    ordered = sorted(items, key=lambda item: item.address)
-    blocks = [ordered[:1]]
-    for before, item in pairwise(ordered):
-        if before.address + before.size == item.address:
-            blocks[-1].append(item)
-        else:
-            blocks.append([item])
-    return blocks

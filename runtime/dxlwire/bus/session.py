@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import sys
 import threading
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from contextlib import AbstractContextManager, ExitStack
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Protocol
 
+from dxlwire.bus.adjustable_port import LATENCY_NS, AdjustablePort
 from dxlwire.bus_plan import Budget, BusPlan
 from dxlwire.clock import Clock, MonotonicClock
 from dxlwire.exceptions import NotCompiled, PortError
@@ -26,8 +28,6 @@ from dxlwire.port.serial_open import open_serial, rate_remark
 from dxlwire.transaction import Program, Result
 from dxlwire.wire.dialect import dialect_of
 
-LATENCY_NS = 1_000_000
-"""Assumed latency (ns) of an adapter without a known latency timer: one frame of full-speed USB."""
 STALL_NS = 100_000_000
 """Latency (ns) that is assumed of simulated servos: their process may have to wait for a processor."""
 RECORDERS = "dxlwire_recorders"
@@ -69,7 +69,7 @@ class SessionLog(PacketLog):
         return None if self.recording is None else self.recording.commit_packets()
 
 
-class OpenLine:
+class OpenLine(ABC):
     """An open line: its timing, its log, and a lock for threads. Base class of both sessions."""
 
     def __init__(self, plan: BusPlan, close: Callable[[], None]) -> None:
@@ -88,13 +88,13 @@ class OpenLine:
         if self._closed:
             raise PortError(f"{self.name} is closed; use the bus inside its `with` block")
 
+    @abstractmethod
     def run_program(self, program: Program[Result]) -> Result:
         """Run a program to its end and return its result.
 
         Raises:
             PortError: The line is closed or lost.
         """
-        raise NotImplementedError
 
     def record(self, path: Path) -> None:
         """Record all packets from now on in a new file.
@@ -156,8 +156,7 @@ class SdkSession(OpenLine):
     """An open line on which `dynamixel-sdk` exchanges the packets, one transaction after the other."""
 
     def __init__(self, path: str, baud_rate: int, protocol: float) -> None:
-        # Imported here because it is not needed where the kernel is compiled.
-        from dxlwire.bus.adjustable_port import AdjustablePort
+        # Imported here because the SDK is not needed where the kernel is compiled.
         from dxlwire.bus.sdk_port import SdkPort
 
         port = AdjustablePort(path, baud_rate, boot_ns=0)
@@ -200,10 +199,10 @@ def open_session(path: str, baud_rate: int, protocol: float) -> Session | SdkSes
 
     Raises:
         PortError: The port cannot be opened, or the adapter does not support the baud rate.
-        ValueError: There is no such protocol.
+        ValueError: The protocol is unknown.
     """
     if protocol not in (1.0, 2.0):
-        raise ValueError(f"protocol {protocol}: there are 1.0 and 2.0")
+        raise ValueError(f"protocol {protocol} is unknown; use 1.0 or 2.0")
     if sys.platform != "linux" or not _is_compiled():
         return SdkSession(path, baud_rate, protocol)
     serial = open_serial(path, baud_rate)

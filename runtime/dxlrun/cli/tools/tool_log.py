@@ -5,7 +5,7 @@ from __future__ import annotations
 import platform
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -25,13 +25,20 @@ TOOL_NAME = "tool"
 
 @contextmanager
 def tool_log(path: Path | None, command: str, buses: Sequence[str] = ("line",)) -> Iterator[PacketLog | None]:
-    """Yield a sink that writes packets to a new log, which is closed with the block; None without a path.
-
-    `buses` are the names of the lines. Raises InputError when the file exists or cannot be written.
-    """
+    """Yield a log of packets as `new_log`; None without a path."""
     if path is None:
         yield None
         return
+    with new_log(path, command, buses) as packets:
+        yield packets
+
+
+@contextmanager
+def new_log(path: Path, command: str, buses: Sequence[str]) -> Iterator[PacketLog]:
+    """Yield a log that writes packets to a new file, which is closed with the block.
+
+    `buses` are the names of the lines. Raises InputError when the file exists or cannot be written.
+    """
     from dxlrun.channels.logged_packets import PacketBatch
     from dxlrun.channels.ring import Handover
     from dxlrun.log.identity import HOST, IDENTITY_NAME, code_hashes
@@ -64,15 +71,9 @@ def tool_log(path: Path | None, command: str, buses: Sequence[str] = ("line",)) 
             print_warning(incomplete_log(error_text))
 
 
-@contextmanager
-def record_line(path: Path, line: str) -> Iterator[PacketLog]:
-    """Yield a log of the packets of a script's line, for `dxlwire.Bus.record`; it is closed with the block.
-
-    Raises InputError when the file exists or cannot be written.
-    """
-    with tool_log(path, "dxlwire.Bus", (line,)) as log:
-        assert log is not None  # noqa: S101  there is a path
-        yield log
+def record_line(path: Path, line: str) -> AbstractContextManager[PacketLog]:
+    """Return a log of the packets of a script's line, for `dxlwire.Bus.record`; see `new_log`."""
+    return new_log(path, "dxlwire.Bus", (line,))
 
 
 class BusesLog:

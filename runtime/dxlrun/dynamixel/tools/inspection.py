@@ -17,11 +17,11 @@ from dxlrun.dynamixel.servo.checks import LISTEN_NS, inspect_servo, survey
 from dxlrun.dynamixel.servo.item_access import Access, first_reach
 from dxlrun.dynamixel.servo.mode_switches import read_limits, servo_limits
 from dxlrun.dynamixel.servo.registers import read_registers
-from dxlrun.dynamixel.tools.scanning import identity
 from dxlrun.dynamixel.tools.tool_line import ToolLine
 from dxlrun.dynamixel.tools.tool_port import TunablePort
 from dxlrun.errors import StartUpError
 from dxlrun.plan.loop_plan import JointPlan
+from dxlwire.bus.programs import identity
 from dxlwire.bus_plan import BusPlan, RegisterValue, ServoPlan
 from dxlwire.control_table import ControlTable, FoundDeviation, find_table, models_by_number
 from dxlwire.packets import PacketSink
@@ -229,7 +229,7 @@ def _look(plan: BusPlan, joints: Mapping[int, JointPlan]) -> Program[InspectionR
     surveyed = Findings()
     yield from survey(plan, False, surveyed)
     remarks = [f"{joint}: {text}" for joint, text in surveyed.texts(EventCode.REGISTER_DIFFERS)]
-    answered = {joint for joint, _ in surveyed.texts(EventCode.SETUP)}
+    answered = [joint for joint, _ in surveyed.texts(EventCode.SETUP)]  # One text for each servo
     found = InspectionResult(len(answered), problems=surveyed.problems, remarks=remarks)
     found.deviations = [_deviation(*one) for one in surveyed.deviations]
     for servo in plan.servos:

@@ -17,6 +17,7 @@ from msgspec.structs import replace
 
 from dxlrun.dynamixel.remedies import CHECK, choose_remedy
 from dxlrun.dynamixel.tools.tool_line import ToolLine, refuse_echo
+from dxlwire.bus.programs import IDENTITY_LENGTH, SHORT_TIMEOUT_NS, SLOT_NS, identity
 from dxlwire.control_table import ControlItem, ControlTable, all_tables, models_by_number
 from dxlwire.control_table.device_models import devices_by_number
 from dxlwire.plan.line import MOST_SPARE, Line, listen_transaction
@@ -24,12 +25,6 @@ from dxlwire.plan.retry import ATTEMPTS, extend_timeouts, retry
 from dxlwire.transaction import BROADCAST_ID, Program, Reply, Transaction, TransactionOutcome
 from dxlwire.wire.dialect import dialect_of
 
-SHORT_TIMEOUT_NS = 2_000_000
-"""Timeout (ns) of a ping that is probably not answered, beyond the latest time by the wire."""
-SLOT_NS = 3_000_000
-"""Time (ns) for each ID after a broadcast ping, in addition to the bytes of its answer (dynamixel-sdk,
-broadcastPing).
-"""
 LATE_NS = 20_000_000  # listening time after the last request at a rate, for replies that the adapter delays
 LATE_OF_FEW_NS = 100_000_000
 """Listening time (ns) like LATE_NS, but if few IDs are pinged: then the machine may be late, too."""
@@ -39,10 +34,6 @@ of a packet, and discard it after a pause of 100 ms (protocol.md, Line).
 """
 FEW = 20  # up to this many IDs, single pings are faster than a broadcast
 _USUAL = (1_000_000, 57_600, 115_200)
-_IDENTITY_LENGTH = 3
-"""Bytes that identify a node, model number (2) and firmware version (1): the reply to a ping of Protocol 2.0,
-bytes 0..2 of the table in 1.0.
-"""
 _LIMITS = (("min_position_limit", "max_position_limit"), ("cw_angle_limit", "ccw_angle_limit"))
 _TRIES = 2  # pings at each of several rates
 _TRIES_ALONE = 4  # pings if protocol and rate are given; their timeouts are longer
@@ -164,7 +155,7 @@ def _search(tool: ToolLine, ids: Sequence[int], beat: Callable[[float], None]) -
     yield listen_transaction(DISCARD_NS if line.dialect.PROTOCOL == 1.0 else LATE_NS)
     heard.clear_records()
     # Only Protocol 2.0, whose ping replies contain the model number, has a broadcast ping with slots.
-    if line.dialect.PING_LENGTH >= _IDENTITY_LENGTH and len(ids) > FEW:
+    if line.dialect.PING_LENGTH >= IDENTITY_LENGTH and len(ids) > FEW:
         slot_ns = line.wire_ns(line.dialect.OVERHEAD + line.dialect.PING_LENGTH) + SLOT_NS
         ping = line.unanswered(line.dialect.ping(BROADCAST_ID))
         slots_ns = slot_ns * (len(ids) + 1) + line.latency_ns
@@ -223,16 +214,6 @@ def _answering(line: Line, suspected: Sequence[int]) -> Program[set[int]]:
 
 def _hurried(tool: ToolLine, transaction: Transaction, timeout_ns: int) -> Transaction:
     return structs.replace(transaction, timeout_ns=transaction.due_ns + tool.port.latency_ns + timeout_ns)
-
-
-def identity(line: Line, servo_id: int) -> Program[tuple[Reply, Reply]]:
-    """Ping a servo; return the reply to the ping, and the reply that contains model number and firmware
-    version.
-    """
-    ping = yield from retry(line.ping(servo_id))
-    if not ping.answered or line.dialect.PING_LENGTH >= _IDENTITY_LENGTH:
-        return ping, ping
-    return ping, (yield from retry(line.read_range(servo_id, 0, _IDENTITY_LENGTH, MOST_SPARE)))
 
 
 def read_servo(line: Line, servo_id: int, port: str) -> Program[FoundServo]:
