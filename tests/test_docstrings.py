@@ -79,6 +79,7 @@ def test_the_examples_of_the_tooling_run(monkeypatch: pytest.MonkeyPatch, tmp_pa
     assert all(made), made
 
 
+@pytest.mark.needs("logs")
 def test_no_name_is_on_two_pages_of_the_faces() -> None:
     """Each name has one home, and each page imports what it offers."""
     names = list(dxlrun.__all__)

@@ -22,6 +22,7 @@ GENERATE = ROOT / "docs/generate.py"
 MOST_WORDS = 40_000
 
 
+@pytest.mark.needs("logs")
 def test_reference_is_up_to_date() -> None:
     """In a process of its own: installed packages that are not of this repository must not show."""
     checked = subprocess.run(
