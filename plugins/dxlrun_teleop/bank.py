@@ -18,10 +18,13 @@ Row = Mapping[str, Any]
 USUAL_SPEED = {"rad": 0.5, "m": 0.05}
 """Speed of a joint at full deflection of an axis and speed factor 1, by unit: rad/s and m/s"""
 USUAL_TWIST = {"linear": 0.2, "angular": 1.0}
-"""Speed of a mobile base at full deflection of an axis and speed factor 1, m/s and rad/s. It is lower if the
-base needs longer than BRAKING_S to stop."""
+"""Speed of a base, or of a tip in space, at full deflection of an axis and speed factor 1, m/s and rad/s.
+It is lower if the base or the tip needs longer than BRAKING_S to stop."""
 BRAKING_S = 0.2
-"""Longest time in which a base stops from full deflection, s"""
+"""Longest time in which a base or a tip stops from full deflection, s"""
+SPACE = dict.fromkeys(("vx", "vy", "vz"), "linear") | dict.fromkeys(("wz", "wy", "wx"), "angular")
+"""Limits of each number of a twist in space, in the order of the axes: forward, left, up and yaw, as the
+sticks of a gamepad are deflected, then pitch and roll"""
 HORIZON_S = 0.1
 """Duration of the trajectories that drive a joint of a trajectory controller, s. Each one ends at rest, so
 the joint stops without a further command."""
@@ -40,6 +43,7 @@ class CommandForm(Enum):
     POSVEL = frozenset({"positions", "velocities"}), True
     VELOCITIES = frozenset({"velocities"}), False
     TWIST = frozenset({"linear", "angular"}), False
+    SPACE = frozenset({*SPACE, "frame"}), False
     TRAJECTORY = frozenset({"points", "joints"}), True
 
     def __init__(self, fields: frozenset[str], integrates: bool) -> None:
@@ -83,7 +87,7 @@ class Bank(msgspec.Struct, frozen=True):
     def build_command(self, values: Sequence[float], factor: float) -> dict[str, object]:
         """Return the fields of the controller's command with these values, one per slot (SI units)."""
         match self.form:
-            case CommandForm.TWIST:
+            case CommandForm.TWIST | CommandForm.SPACE:
                 return {slot.name: value for slot, value in zip(self.slots, values, strict=True)}
             case CommandForm.VELOCITIES:
                 return {"velocities": values}
@@ -142,16 +146,22 @@ def banks_of(robot: RemoteRobot, targets: Sequence[str], axes: int) -> list[Bank
 
 
 def _follows(one: Row, info: Row) -> bool:
-    """Return True if a controller reads the states of joints to move its own, such as a leader_follower."""
-    return any(read.split("/")[0] in info["units"] for read in one["reads"])
+    """Return True if a controller moves as other joints do, such as a leader_follower: it reads the age of
+    their states."""
+    return not {f"{joint}/age" for joint in info["units"]}.isdisjoint(one["reads"])
 
 
 def _bank(robot: RemoteRobot, one: Row, info: Row) -> Bank | None:
     """Return a bank that drives all numbers of a controller's command; None if no Form fits it."""
     for kind, schema in one["takes"].items():
         for form in (form for form in CommandForm if form.fits(schema.get("properties", ()))):
-            twist = form is CommandForm.TWIST
-            slots = _twist(robot, one) if twist else [_joint(joint, info, form) for joint in one["joints"]]
+            match form:
+                case CommandForm.TWIST:
+                    slots = _twist(robot, one, {field: field for field in USUAL_TWIST})
+                case CommandForm.SPACE:
+                    slots = _twist(robot, one, SPACE)
+                case _:
+                    slots = [_joint(joint, info, form) for joint in one["joints"]]
             places = tuple(range(len(slots)))
             return Bank(one["name"], kind, form, tuple(slots), places, tuple(one["into"]))
     return None
@@ -163,13 +173,13 @@ def _joint(name: str, info: Row, form: CommandForm) -> Slot:
     return Slot(name, unit, min(USUAL_SPEED[unit], most), most, *info["limits"].get(name, ()))
 
 
-def _twist(robot: RemoteRobot, one: Row) -> list[Slot]:
-    """Return the slots linear and angular of a base controller, with speeds from which it can stop in
-    BRAKING_S by the limits in its parameters."""
+def _twist(robot: RemoteRobot, one: Row, fields: Mapping[str, str]) -> list[Slot]:
+    """Return the slots of a twist, whose fields have linear or angular limits, with speeds from which a base
+    or a tip can stop in BRAKING_S by the limits in the controller's parameters."""
     given, slots = robot.parameters(one["name"]), []
-    for field, unit in (("linear", "m"), ("angular", "rad")):
+    for field, kind in fields.items():
         most, rise, sink, jerk = (
-            float(text.split()[0]) if isinstance(text := given.get(f"{field}.{limit}"), str) else math.inf
+            float(text.split()[0]) if isinstance(text := given.get(f"{kind}.{limit}"), str) else math.inf
             for limit in ("velocity", "acceleration", "deceleration", "jerk")
         )
         braking = rise if math.isinf(sink) else sink
@@ -177,5 +187,6 @@ def _twist(robot: RemoteRobot, one: Row) -> list[Slot]:
         growth_s = 0.0 if math.isinf(jerk) else min(BRAKING_S / 2, braking / jerk)
         # Area of a deceleration that ramps up and down in growth_s each.
         stops_from = (min(braking, jerk * growth_s) if growth_s else braking) * (BRAKING_S - growth_s)
-        slots.append(Slot(field, unit, min(USUAL_TWIST[field], most, stops_from), most))
+        unit = "m" if kind == "linear" else "rad"
+        slots.append(Slot(field, unit, min(USUAL_TWIST[kind], most, stops_from), most))
     return slots

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from itertools import pairwise
 from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
 
+import numpy as np
 import pytest
 from tests.kit.driven import DrivenRobot, changes
+from tests.kit.judged_arms import arms
 
 from dxlrun import RemoteRobot
 from dxlrun_teleop.bank import banks_of
@@ -85,25 +88,27 @@ class Case(NamedTuple):
     item: tuple[int, int]
     targets: tuple[str, ...] = ()
     arguments: Mapping[str, str] = MappingProxyType({})
+    axes: tuple[float, ...] = (1.0,)
 
 
-SLOWING_S = {"base": 0.2}
-"""A base slows down within its limit of acceleration from then on."""
+SLOWING_S = {"base": 0.2, "space": 0.2}
+"""A base, or a tip in space, slows down within its limit of acceleration from then on."""
 CASES = {
     "base": Case("diff_drive.yaml", VELOCITY),
     "wheels": Case("diff_drive.yaml", VELOCITY, (), {"base": "false", "wheels": "true"}),
     "trajectory": Case("leader_follower.yaml", POSITION, ("left_arm",)),
     "posvel": Case("bioloid_torso.yaml", (30, 2), ("head",)),
     "group": Case("arm", POSITION, ("wrist",)),
+    "space": Case("open_manipulator_x_space.yaml", POSITION, ("vz",), axes=(-1.0,)),
 }
 
 
 @pytest.mark.parametrize("ending", ["released", "unplugged", "killed"])
 @pytest.mark.parametrize("case", CASES)
 def test_the_robot_holds_within_250_ms(tmp_path: Path, case: str, ending: str) -> None:
-    name, item, targets, arguments = CASES[case]
+    name, item, targets, arguments, axes = CASES[case]
     robot = arm(tmp_path) if name == "arm" else ROBOTS / name
-    run = driven(robot, ending, *targets, arguments=arguments)
+    run = driven(robot, ending, *targets, arguments=arguments, axes=axes)
     goals = {servo: found for servo, found in goals_of(run, *item).items() if found[-1][0] > BEGIN_S}
     goals.pop(3, None)  # the follower of leader_follower comes after the measured position of its leader
     assert goals
@@ -117,6 +122,29 @@ def test_the_robot_holds_within_250_ms(tmp_path: Path, case: str, ending: str) -
         else:
             assert abs(before - found[0][1]) > 50, found  # ticks: on the way, all the time
             assert len(moved) > 10
+
+
+def test_tip_in_space_keeps_its_limits_and_those_of_the_joints() -> None:
+    """Judged by the goals of the servos, with forward kinematics of the tests' own."""
+    arm = arms()["open_manipulator_x"]
+    run = driven(
+        ROBOTS / "open_manipulator_x_space.yaml", "killed", "arm", axes=(-0.6, 0.3, -1, 0, 0.2, 0), factor=10
+    )
+    goals = goals_of(run, *POSITION)
+    times = np.arange(BEGIN_S, 3.0, 0.05)
+    rows = [
+        [
+            (next(value for at, value in reversed(goals[servo]) if at <= time) - 2048) * math.tau / 4096
+            for servo in (11, 12, 13, 14)
+        ]
+        for time in times
+    ]
+    speeds = np.abs(np.diff(rows, axis=0)) / 0.05
+    tips = np.array([arm.matrix(row)[:3, 3] for row in rows])
+    tip_speeds = np.linalg.norm(np.diff(tips, axis=0), axis=1) / 0.05
+    assert speeds.max() < 4.8
+    assert 0.15 < tip_speeds.max() < 0.2 * 1.05
+    assert tip_speeds[times[1:] > END_S + 0.15 + 0.4 + 0.1].max() == 0.0  # lease, and 0.2 m/s at 0.5 m/s^2
 
 
 def test_client_that_stood_still_moves_on_from_where_the_joint_is(tmp_path: Path) -> None:
