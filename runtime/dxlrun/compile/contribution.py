@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, TypeAlias
 
 import msgspec
 
@@ -13,12 +13,17 @@ if TYPE_CHECKING:
     from dxlrun.compile.joints.compiled_urdf import CompiledUrdf
     from dxlrun.compile.problems import RobotFile
     from dxlrun.control.controllers.plugin_loading import PlugIns
+    from dxlrun.description.units import Measure
     from dxlrun.plan.loop_plan import ControllerPlan, SourcePlan
     from dxlrun.plan.mechanics_plan import MechanicsPlan
     from dxlrun.plan.recording_plan import RecordingPlan
     from dxlsim.simulation_plan import DeviceReadings
     from dxlwire.bus_plan import DevicePlan
     from dxlwire.control_table.device_table import DeviceTable
+
+
+Poses: TypeAlias = "Mapping[str, Mapping[str, Measure]]"
+"""Positions of joints by the name of the pose."""
 
 
 class Compilation(msgspec.Struct, frozen=True):
@@ -68,6 +73,8 @@ class Contribution(msgspec.Struct, frozen=True):
     """Assignment of servos to joints, if some joints have several servos; only one feature may set it."""
     recording: RecordingPlan | None = None
     """Folder and settings of the log; only one feature may set it."""
+    poses: Mapping[str, Mapping[str, float]] = {}
+    """Positions of joints, rad or m, by the names by which policies, motions and keyframes use them."""
     policies: Mapping[str, str] = {}
     """Texts for `dxlrun check` that say what the feature's policies do, by `policy` or `policy of group`."""
 

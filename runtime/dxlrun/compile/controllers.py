@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from dxlrun.channels.cycle import MOST_CONTROLLERS
-from dxlrun.compile.contribution import Contribution
+from dxlrun.compile.contribution import Contribution, Poses
 from dxlrun.compile.controller_entry import (
     CompiledController,
     WrongEntry,
@@ -32,6 +32,7 @@ from dxlrun.description.document import KeyPath, read_file
 from dxlrun.description.form_problems import errors_between_keys, problems_of
 from dxlrun.description.mistakes.ros_types import ros_type
 from dxlrun.description.reading import Description
+from dxlrun.description.robot import ControllerEntry
 from dxlrun.errors import Mark
 from dxlrun.plan.loop_plan import ControllerPlan
 from dxlwire.modes import Mode, mode_of
@@ -70,17 +71,18 @@ def read_controller_files(file: RobotFile) -> dict[str, str]:
 
 
 def compile_controllers(
-    file: RobotFile, plugins: PlugIns, contributions: Collection[Contribution]
+    file: RobotFile, plugins: PlugIns, contributions: Collection[Contribution], poses: Poses
 ) -> dict[str, CompiledController]:
     """Compile all controllers that have no mistake, by name in file order; check the whole graph of them.
 
-    They can read and command the sources in `contributions`.
+    They can read and command the sources in `contributions`, and name `poses`.
     """
     compiled: dict[str, CompiledController] = {}
     plans: list[ControllerPlan] = []
     for name, entry in file.robot.controllers.items():
+        entry = entry.model_copy(update={"parameters": _with_poses(entry.parameters, poses)})  # noqa: PLW2901
         plan = plan_entry(name, entry, _every(file, name, entry.rate))
-        one = _compiled(file, plan, plugins)
+        one = _compiled(file, plan, plugins, entry)
         if one is not None:
             compiled[name] = one
         plans.append(plan if one is None else one.plan)
@@ -99,7 +101,21 @@ def compile_controllers(
     return compiled
 
 
-def _compiled(file: RobotFile, plan: ControllerPlan, plugins: PlugIns) -> CompiledController | None:
+def _with_poses(value: object, poses: Poses) -> object:
+    """Return parameters with the positions of a pose in place of its name at each key `pose`."""
+    if isinstance(value, list):
+        return [_with_poses(item, poses) for item in value]
+    if not isinstance(value, dict):
+        return value
+    found = {key: _with_poses(item, poses) for key, item in value.items()}
+    if isinstance(name := found.get("pose"), str) and name in poses:
+        found["pose"] = {joint: f"{float(at)!r} {at.unit}" for joint, at in poses[name].items()}
+    return found
+
+
+def _compiled(
+    file: RobotFile, plan: ControllerPlan, plugins: PlugIns, entry: ControllerEntry
+) -> CompiledController | None:
     """Compile one controller; None if it has mistakes, which are added to the file."""
     name, robot = plan.name, file.robot
     offer = _offer(file, name, plan.type, plugins)
@@ -112,9 +128,7 @@ def _compiled(file: RobotFile, plan: ControllerPlan, plugins: PlugIns) -> Compil
         joints = tuple(robot.joints)
         return compile_entry(plan, offer, joints, wrapping=wrapping, groups=groups, omitted=omitted)
 
-    found = report_entry(
-        file, "controller", name, robot.controllers[name], offer.controller.Parameters, make_compiled
-    )
+    found = report_entry(file, "controller", name, entry, offer.controller.Parameters, make_compiled)
     buses = {f"/bus/{bus}" for bus in robot.buses}
     if found is not None and (taken := buses.intersection(found.plan.topics)):
         mark = file.key("controllers", name)

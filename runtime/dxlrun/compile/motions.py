@@ -41,7 +41,15 @@ from dxlrun.compile.problems import Problems, RobotFile
 from dxlrun.contract.controller import Controller, SpeedPeak
 from dxlrun.description.document import refusal
 from dxlrun.description.form_problems import sentences_of
-from dxlrun.description.motion import FormulaPart, MotionDescription, PointsPart, read_motion
+from dxlrun.description.motion import (
+    FormulaPart,
+    MotionDescription,
+    Point,
+    PointsPart,
+    Target,
+    read_motion,
+)
+from dxlrun.description.units import Measure
 from dxlrun.errors import InputError, Mark, suggestion
 from dxlrun.plan.loop_plan import SETTLE_NS, JointPlan, ScheduledCommand, ScheduledGoal
 from dxlrun.plan.robot_plan import MotionPart
@@ -71,6 +79,7 @@ def compile_motions(
     controllers: Mapping[str, CompiledController],
     joints: Mapping[str, CompiledJoint],
     file: RobotFile,
+    poses: Mapping[str, Mapping[str, float]] = {},
 ) -> tuple[list[MotionDescription], list[MotionPart]]:
     """Return the motion files of all motions, and their parts; those with mistakes are omitted.
 
@@ -83,10 +92,47 @@ def compile_motions(
         found = _resolve_motion(one, file, controllers) if isinstance(one, str) else one
         if isinstance(found, MotionDescription):
             played.append(found)
+            try:
+                found = with_poses(found, poses, {name: joint.plan for name, joint in joints.items()})
+            except InputError as error:
+                file.extend(error.problems)
+                continue
             parts += compile_motion(found, controllers, names, joints, file)
         elif found is not None:
             parts += _compile_own_motion(found, file, controllers)
     return played, parts
+
+
+def with_poses(
+    motion: MotionDescription, poses: Mapping[str, Mapping[str, float]], joints: Mapping[str, JointPlan]
+) -> MotionDescription:
+    """Return a motion whose points have the joints of the poses that they name; raise InputError."""
+    problems = Problems()
+
+    def posed(point: Point, number: int, index: int) -> Point:
+        if point.pose is None:
+            return point
+        if point.pose not in poses:
+            mark = motion.marks.value("motions", index, "points", number, "pose")
+            fix = suggestion(point.pose, tuple(poses)) if poses else "add it to poses of the robot file"
+            problems.error(mark, f"the robot has no pose {point.pose}", fix)
+        targets = {
+            joint: Target(position=Measure(position, joints[joint].unit.si))
+            for joint, position in poses.get(point.pose, {}).items()
+            if joint in joints
+        }
+        return point.model_copy(update={"joints": targets | point.joints})
+
+    parts = [
+        part.model_copy(
+            update={"points": tuple(posed(one, number, index) for number, one in enumerate(part.points))}
+        )
+        if isinstance(part, PointsPart)
+        else part
+        for index, part in enumerate(motion.motion.motions)
+    ]
+    problems.raise_errors()
+    return structs.replace(motion, motion=motion.motion.model_copy(update={"motions": tuple(parts)}))
 
 
 def compile_motion(

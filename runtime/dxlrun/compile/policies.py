@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 
+from dxlrun.compile.contribution import Contribution, Poses
 from dxlrun.compile.joints.compiled_joints import CompiledJoint
 from dxlrun.compile.joints.limits import Interval, degrees, limits_of
 from dxlrun.compile.problems import RobotFile
 from dxlrun.description.document import KeyPath
 from dxlrun.description.robot import PoseStep, TorqueStep, WrittenPolicy
+from dxlrun.description.units import Measure
 from dxlrun.errors import suggestion
 from dxlrun.features.feature import PolicyKey
 from dxlrun.plan.policy_plan import (
@@ -31,21 +33,39 @@ MARGIN_NS = 100_000_000
 _EXAMPLES: Mapping[JointUnit, str] = {ROTARY: "60 deg", LINEAR: "20 mm"}
 
 
+def compile_poses(
+    file: RobotFile, joints: Mapping[str, CompiledJoint], contributions: Mapping[str, Contribution]
+) -> Poses:
+    """Return all poses: those of the section `poses`, checked, and those of features, by section."""
+    _check_poses(file, joints)
+    poses: dict[str, Mapping[str, Measure]] = dict(file.robot.poses)
+    for section, contribution in contributions.items():
+        for name, positions in contribution.poses.items():
+            if name in poses:
+                file.error(file.key(section, name), f"{name} is already the name of a pose", "rename one")
+            poses[name] = {
+                joint: Measure(at, joints[joint].plan.unit.si)
+                for joint, at in positions.items()
+                if joint in joints
+            }
+    return poses
+
+
 def compile_policies(
     file: RobotFile,
     joints: Mapping[str, CompiledJoint],
     buses: Sequence[BusPlan],
     keys: Iterable[PolicyKey[WrittenPolicy]],
+    poses: Poses,
 ) -> PolicyPlan:
     """Compile all policies of a file; add errors if steps do not fit the robot or take too long."""
-    _check_poses(file, joints)
     robot = file.robot
     limit_ns = robot.policies.exit_timeout - _reserve_ns(buses, robot.loop.rate)
     written = {"on_exit": robot.policies.on_exit, "on_fault": robot.policies.on_fault}
     written |= {each.name: each.value_of(robot.policies) for each in keys}
     found: dict[str, Policy] = {}
     for name, steps in written.items():
-        found[name] = _policy(file, name, steps, joints)
+        found[name] = _policy(file, name, steps, joints, poses)
         if any(step.levels for step in found[name].steps):
             _check_torque(file, name, steps, buses)
         if found[name].steps and found[name].longest_ns > limit_ns:
@@ -77,7 +97,11 @@ def _check_poses(file: RobotFile, joints: Mapping[str, CompiledJoint]) -> None:
 
 
 def _policy(
-    file: RobotFile, name: str, written: WrittenPolicy, joints: Mapping[str, CompiledJoint]
+    file: RobotFile,
+    name: str,
+    written: WrittenPolicy,
+    joints: Mapping[str, CompiledJoint],
+    poses: Poses,
 ) -> Policy:
     if isinstance(written, str):
         return HOLD if written == "hold" else LIMP
@@ -91,10 +115,10 @@ def _policy(
                 file.error(mark, f"{name} has steps after {step}", f"write {step} as the last step")
         elif isinstance(step, PoseStep):
             mark_path = ("policies", name, index, "pose")
-            angles = file.robot.poses.get(step.pose)
+            angles = poses.get(step.pose)
             if angles is None:
                 mark = file.at(*mark_path)
-                known = tuple(file.robot.poses)
+                known = tuple(poses)
                 what = f"pose {step.pose} of {name} is not defined"
                 file.error(mark, what, suggestion(step.pose, known) if known else "add it to poses")
             else:

@@ -30,7 +30,7 @@ from dxlrun.compile.joints.described_servos import AUTO, used_features
 from dxlrun.compile.joints.motors import read_motors
 from dxlrun.compile.motion_names import is_name
 from dxlrun.compile.orientations import check_orientations
-from dxlrun.compile.policies import compile_policies
+from dxlrun.compile.policies import compile_policies, compile_poses
 from dxlrun.compile.problems import RobotFile
 from dxlrun.compile.simulation import compile_simulation
 from dxlrun.control.controllers.plugin_loading import load_plugins
@@ -183,7 +183,8 @@ def compile_robot(
     sources = tuple(source for each in contributions for source in each.sources)
     devices = (device for each in contributions for device in each.devices)
     simulation = compile_simulation(file, joints, devices, motors)
-    controllers = compile_controllers(file, plugins, contributions)
+    poses = compile_poses(file, joints, by_feature)
+    controllers = compile_controllers(file, plugins, contributions, poses)
     states = {one.name: one.states for one in sources}
     states |= {name: one.plan.provides for name, one in controllers.items() if one.plan.provides}
     frames = compile_frames(file, body, states)
@@ -197,26 +198,27 @@ def compile_robot(
     modes = compile_modes(file, joints, controllers)
     buses = compile_buses(file, joints, contributions, modes)
     policy_keys = [one for _, one in stages(PolicyKey, features) if one.does]
-    policies = compile_policies(file, joints, buses, policy_keys)
+    policies = compile_policies(file, joints, buses, policy_keys, poses)
     parts: list[MotionPart] = []
     played: list[MotionDescription] = []
     if motions:
         from dxlrun.compile.motions import check_times, compile_motions  # as above
 
-        played, parts = compile_motions(motions, controllers, joints, file)
+        played, parts = compile_motions(motions, controllers, joints, file, poses)
         check_times(parts, duration_ns, file)
     file.raise_errors()
     if duration_ns is None and all(part.points for part in parts):
         # The approach of a controller's own motion takes a time that is not known before the run.
         duration_ns = max((part.end_ns or 0 for part in parts), default=None)
-    commands = (command for part in parts for command in part.commands)
     settings = file.robot.loop
     loop = LoopPlan(
         period_ns=round(1e9 / settings.rate),
         scheduler=_scheduler_plan(settings),
         joints=tuple(joint.plan for joint in joints.values()),
         controllers=tuple(controller.plan for controller in controllers.values()),
-        commands=tuple(sorted(commands, key=lambda command: command.at_ns)),
+        commands=tuple(
+            sorted((each for part in parts for each in part.commands), key=lambda each: each.at_ns)
+        ),
         end_ns=duration_ns,
         ends_with_goals=duration_ns is None and bool(parts),
         policies=policies,
@@ -249,6 +251,7 @@ def compile_robot(
         frames=frames,
         simulation=simulation,
         groups=description.groups,
+        poses={name: {joint: float(at) for joint, at in pose.items()} for name, pose in poses.items()},
         omitted=description.omitted,
         gateway=robot.processes.gateway.enabled,
         packages=plugins.packages_of(loop.controllers, _models(buses))

@@ -55,7 +55,16 @@ class Point(Form):
     """Form of a point of a motion: a time, and goals of some joints."""
 
     time: Duration = key("Time since the start of the part.", "1 s")
-    joints: dict[Name, Target] = key("Targets by joint.", "{head_joint: {position: 30 deg}}", min_length=1)
+    joints: dict[Name, Target] = key("Targets by joint.", "{head_joint: {position: 30 deg}}", {})
+    pose: Name | None = key(
+        "Pose of the robot file, for the joints that `joints` does not name.", "rest", None
+    )
+
+    @model_validator(mode="after")
+    def _moves_something(self) -> Self:
+        if not self.joints and self.pose is None:
+            raise validation_error("the point has no targets", "add joints, or the name of a pose")
+        return self
 
 
 class Formula(Form):

@@ -324,7 +324,7 @@ class Robot(Form):
         "Controllers by name, in the order of their updates.", "{head: {type: ...}}", {}
     )
     poses: dict[Name, Annotated[dict[Name, Position], Field(min_length=1)]] = key(
-        "Poses by name, with positions of some or all joints, for policies.",
+        "Poses by name, with positions of some or all joints, for policies, motions and keyframes.",
         "{home: {head_joint: 0 deg}}",
         {},
     )

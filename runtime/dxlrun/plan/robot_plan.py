@@ -60,6 +60,8 @@ class Plan(msgspec.Struct, frozen=True):
     packages: dict[str, str] = {}
     """Distributions of the plug-in packages that run in this robot, by package: controllers, sensors, servo
     models, physics and hooks of the loop."""
+    poses: dict[str, dict[str, float]] = {}
+    """Positions of joints, rad or m, by the name of the pose that motions may use."""
     mechanics: MechanicsPlan = MechanicsPlan()
     """Assignment of servos to joints; empty: each joint has one servo."""
 

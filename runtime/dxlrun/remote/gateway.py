@@ -41,6 +41,7 @@ from dxlrun.channels.loop_requests import (
     TorqueRequest,
     Unload,
 )
+from dxlrun.compile.motions import with_poses
 from dxlrun.contract.controller import Outcome
 from dxlrun.description.motion import parse_motion
 from dxlrun.description.source_names import SOURCE_COMMANDS
@@ -452,6 +453,7 @@ class GatewayApp:
         try:
             plan = self._link.plan
             motion = parse_motion(given.text, Path(file), plan.groups, plan.omitted)
+            motion = with_poses(motion, plan.poses, self._preparation.joints)
             # Read after parsing, which may have taken long: the motion begins where the joints are now.
             record = self._newest()
             controllers = {
