@@ -5,10 +5,13 @@ from __future__ import annotations
 import platform
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
+from types import SimpleNamespace
 from typing import IO, TypeVar, cast
 
+import mcap.writer
 import msgspec
 import zstandard
 from mcap.writer import CompressionType, Writer
@@ -26,13 +29,19 @@ from dxlrun.messages.declared import declared_message
 from dxlrun.messages.definition import MessageType
 
 Written = TypeVar("Written")
-CHUNK_BYTES = 512 * 1024
-"""Size of the collected messages, bytes, above which they are written to the file as a chunk."""
+CHUNK_BYTES = 2 * 1024 * 1024
+"""Size of the collected messages, bytes, above which they are written to the file as a chunk: the window of
+zstandard at LEVEL."""
+LEVEL = 6
+"""Level of zstandard for chunks. The default, 3, takes 5 us a cycle instead of 15, and up to a fifth more
+bytes; 7 saves another half percent."""
 _COMPRESSED_FROM = 16 * 1024
 """Size from which an attachment is compressed, bytes. Smaller ones remain readable as text."""
 _LIBRARY = "dxlrun"
 _PACKAGE = "dxlrun_msgs"
 _LIBRARIES = ("dxlrun", "mcap", "numpy")
+# The library has no option for the level.
+setattr(mcap.writer, "zstandard", SimpleNamespace(compress=partial(zstandard.compress, level=LEVEL)))  # noqa: B010
 _MEDIA_TYPES = {".json": "application/json", ".yaml": "application/yaml", ".txt": "text/plain"}
 
 
