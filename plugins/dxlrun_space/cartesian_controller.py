@@ -23,6 +23,7 @@ from dxlrun import (
     Goal,
     InputError,
     Interfaces,
+    Length,
     LinearAcceleration,
     LinearVelocity,
     Mismatch,
@@ -33,8 +34,17 @@ from dxlrun import (
 )
 from dxlrun.tooling.robots import FrameTree, Urdf, read_urdf
 from dxlrun_space.chain import IDENTITY, Chain, Pose, Rotation, Vector, WrongChain, rotation_of
-from dxlrun_space.path import MotionLimits, NoPath, Path, Planning, Positions, plan_joints, plan_line
-from dxlrun_space.solver import Solver, residual_of
+from dxlrun_space.path import (
+    MotionLimits,
+    NoPath,
+    Path,
+    Planning,
+    Positions,
+    plan_joints,
+    plan_line,
+    shifted,
+)
+from dxlrun_space.solver import Solution, Solver, distance, residual_of
 from dxlrun_space.space_goals import (
     PoseCommand,
     PoseGoal,
@@ -45,7 +55,7 @@ from dxlrun_space.space_goals import (
     read_pose,
     read_twist,
 )
-from dxlrun_space.stream import TwistMotion
+from dxlrun_space.stream import TwistMotion, approach
 
 ACCELERATION: Final = 20.0
 """Acceleration of joints without a limit, rad/s^2; an XM430 stops from its highest speed in 0.25 s."""
@@ -59,6 +69,8 @@ MOST_STEPS: Final = 50
 """Most steps of a cycle, 3 ms."""
 FEEDBACK_NS: Final = 100_000_000
 """Time between two feedback messages of a goal, ns."""
+LEASH_M: Final = 0.02
+"""Longest distance of the pose that moves toward a leader from what is in reach, m: the way back is short."""
 _LONGEST_STOP_S: Final = 2.0
 _BASE: Final[Pose] = (IDENTITY, (0.0, 0.0, 0.0))
 _ZERO: Final[Vector] = (0.0, 0.0, 0.0)
@@ -82,6 +94,21 @@ class RotationLimits(ParametersModel):
     """Highest angular acceleration of the tip, rad/s^2."""
 
 
+class LeaderParameters(ParametersModel):
+    """Another arm, whose tip is followed."""
+
+    joints: Annotated[tuple[str, ...], Field(min_length=1)]
+    """All joints that move its tip in its base."""
+    tip: str
+    """Link of the URDF that leads. Its axes are those of the tip that follows."""
+    base: str = ""
+    """Link of the URDF whose axes are those of the follower's base; empty: the root."""
+    scale: Annotated[float, Field(gt=0)] = 1.0
+    """Factor on the position of the leader's tip."""
+    offset: Annotated[tuple[Length, ...], Field(min_length=3, max_length=3)] = (0.0, 0.0, 0.0)
+    """Offset added to the scaled position: x, y, z, m."""
+
+
 class CartesianParameters(ParametersModel):
     """Keys of a cartesian_controller in the robot file."""
 
@@ -99,15 +126,20 @@ class CartesianParameters(ParametersModel):
     posture: Mapping[str, Angle] = {}
     """Positions by joint to which the arm tends where a pose leaves a choice. By default it turns little."""
     timeout: Annotated[Duration, Field(gt=0)] = 200_000_000
-    """Validity of a twist. An older one is 0."""
+    """Longest age of a twist, or of a leader's state. The tip brakes if it is older."""
+    leader: LeaderParameters | None = None
+    """Arm whose tip is followed. Poses and twists are refused then."""
 
     def mistakes(self) -> Iterator[Mistake]:
-        """Yield each name in `posture` that is not a joint of the controller."""
+        """Yield joints that lead and follow, and names in `posture` that are not joints of the controller."""
         yield from super().mistakes()
         for name in self.posture:
             if name not in self.joints:
                 known = ", ".join(self.joints)
                 yield ("posture", name), f"{name} is not one of its joints; they are {known}"
+        for name in () if self.leader is None else self.leader.joints:
+            if name in self.joints:
+                yield ("leader", "joints"), f"{name} is leader and follower; remove one of the two"
 
 
 @unique
@@ -134,7 +166,12 @@ class CartesianController(Controller[CartesianParameters]):
 
     @classmethod
     def interfaces(cls, parameters: CartesianParameters, joints: tuple[str, ...]) -> Interfaces:
-        """Command positions; read the positions of all other joints, for frames that these move."""
+        """Command positions; read the positions of all other joints, for frames that these move, or the
+        positions and ages of the leader's joints.
+        """
+        if (leader := parameters.leader) is not None:
+            reads = [f"{joint}/{state}" for state in ("position", "age") for joint in leader.joints]
+            return Interfaces(parameters.joints, ("position",), reads=tuple(reads))
         others = tuple(f"{joint}/position" for joint in joints if joint not in parameters.joints)
         return Interfaces(parameters.joints, ("position",), reads=others)
 
@@ -144,16 +181,20 @@ class CartesianController(Controller[CartesianParameters]):
         if robot.urdf is None:
             yield Mismatch("needs a URDF, but the robot file names none", "write `model: {urdf: NAME.urdf}`")
             return
+        place = ""
         try:
             urdf = read_urdf(robot.urdf)
             Chain(urdf, parameters.base, parameters.tip, parameters.joints)
+            if (leader := parameters.leader) is not None:
+                place = "leader."
+                Chain(urdf, leader.base, leader.tip, leader.joints)
             for name, unit in zip(robot.joints, robot.units, strict=True):
                 joint = urdf.joint(name)
                 if joint is not None and (joint.type == "prismatic") != (unit is LINEAR):
                     what = f"needs {name} to be the same in both files, but it is {joint.type} in the URDF"
                     yield Mismatch(what, "correct its type in the URDF", name)
         except WrongChain as wrong:
-            yield Mismatch(f"cannot move the tip: {wrong.what}", wrong.fix, wrong.key)
+            yield Mismatch(f"cannot move the tip: {wrong.what}", wrong.fix, place + wrong.key)
         except InputError as error:
             yield Mismatch(f"cannot use the URDF: {' '.join(str(error).split())}", "correct the URDF")
 
@@ -161,7 +202,9 @@ class CartesianController(Controller[CartesianParameters]):
     def prepare(
         cls, kind: str, command: CommandModel, parameters: CartesianParameters
     ) -> NDArray[np.float64]:
-        """Return a pose or a twist as one flat array."""
+        """Return a pose or a twist as one flat array. Raises ValueError if the tip follows a leader."""
+        if parameters.leader is not None:
+            raise ValueError(f"the tip follows a leader; a {kind} is not accepted")
         if isinstance(command, PoseCommand):
             return flat_pose(command)
         if isinstance(command, TwistCommand):
@@ -177,6 +220,10 @@ class CartesianController(Controller[CartesianParameters]):
         urdf = read_urdf(context.urdf)
         self._chain = Chain(urdf, parameters.base, parameters.tip, context.joints)
         self._frames = _frames(urdf, context)
+        self._leader: Chain | None = None
+        if (leader := parameters.leader) is not None:
+            self._leader = Chain(urdf, leader.base, leader.tip, leader.joints)
+            self._leader_position, self._leader_age = context.reads.reshape(2, -1)
         lower, upper = limits.lower.tolist(), limits.upper.tolist()
         self._limits = MotionLimits(
             tuple(np.where(np.isnan(limits.velocity), SPEED, limits.velocity).tolist()),
@@ -213,6 +260,8 @@ class CartesianController(Controller[CartesianParameters]):
         self._twist = _ZERO, _ZERO
         self._turns_with_tip = False
         self._said_held = False
+        self._followed: Pose | None = None
+        """Pose that moves toward the leader's, and that the tip has."""
 
     def on_activate(self, time_ns: int) -> None:
         """Hold the joints at their last goals."""
@@ -338,8 +387,10 @@ class CartesianController(Controller[CartesianParameters]):
         """Advance planning, path or twist by a period, and command the positions."""
         if not self._at:
             self._hold_joints()
-        elif self.context.states.has_lost and self._phase is not _Phase.RESTING:
+        elif self.context.states.has_lost and (self._leader or self._phase is not _Phase.RESTING):
             self._abandon()
+        elif self._leader is not None:
+            self._follow_leader(self._leader, period_ns * 1e-9)
         elif self._phase is _Phase.PLANNING:
             self._advance_plan()
         elif self._phase is _Phase.STREAMING or (self._phase is _Phase.STOPPING and self._path is None):
@@ -461,8 +512,47 @@ class CartesianController(Controller[CartesianParameters]):
         if self._stream.rests and not (any(linear) or any(angular)):
             self._come_to_rest()
 
+    def _follow_leader(self, chain: Chain, period_s: float) -> None:
+        """Move the followed pose toward that of the leader within the limits in space, and solve it."""
+        begin = self._followed or self._chain.pose(self._at)
+        linear = angular = _ZERO
+        age_s = float(np.maximum.reduce(self._leader_age))  # NaN if one joint has not answered yet
+        if (leader := self.parameters.leader) is not None and age_s <= self.parameters.timeout * 1e-9:
+            rotation, place = chain.pose(self._leader_position.tolist())
+            x, y, z = (leader.scale * a + b for a, b in zip(place, leader.offset, strict=True))
+            way, turn = distance(begin, (rotation, (x, y, z)))
+            linear = approach(way, self._limits.linear_acceleration, period_s)
+            angular = approach(turn, self._limits.angular_acceleration, period_s)
+            self._said_held = False
+        elif not self._said_held:
+            self._said_held = True
+            worst = int(np.argmax(np.where(np.isnan(self._leader_age), np.inf, self._leader_age)))
+            since = "yet" if math.isnan(age_s) else f"for {age_s:.2f} s"
+            self.context.say(f"no reply from leader {chain.joints[worst]} {since}, holding")
+        self._stream.change_twist(linear, angular, period_s)
+        (a, b, c), (u, v, w) = self._stream.linear, self._stream.angular
+        self._followed = shifted(
+            begin, (a * period_s, b * period_s, c * period_s), (u * period_s, v * period_s, w * period_s)
+        )
+        search = self._solver.search_from(
+            self._followed, self._at, exact=self._exact, steps=self._steps // 2 + 2
+        )
+        try:
+            while True:
+                next(search)
+        except StopIteration as done:
+            found: Solution = done.value
+        if (left := found.residual.position) > LEASH_M:
+            way, _ = distance(self._followed, self._chain.pose(found.positions))
+            share = 1 - LEASH_M / left
+            self._followed = shifted(self._followed, (way[0] * share, way[1] * share, way[2] * share), _ZERO)
+        self._at = tuple(
+            now + min(max(goal - now, -most * period_s), most * period_s)
+            for goal, now, most in zip(found.positions, self._at, self._limits.velocity, strict=True)
+        )
+
 
 def _frames(urdf: Urdf, context: Context) -> FrameTree:
     """Return all frames of the robot, moved by its joints."""
-    others = (name.removesuffix("/position") for name in context.read_names)
+    others = (name.removesuffix("/position") for name in context.read_names if name.endswith("/position"))
     return FrameTree(urdf, (*context.joints, *others))

@@ -21,6 +21,9 @@ _DAMPING: Final = 0.01
 _STUCK: Final = 0.02
 """Fraction of the velocity below which a motion counts as held."""
 
+_BRAKING: Final = 0.8
+"""Part of the acceleration for a planned stop. The rest makes up for the length of a period."""
+
 
 class TwistMotion:
     """Motion of a chain by twists.
@@ -61,10 +64,8 @@ class TwistMotion:
         """Set the velocity to 0 at once."""
         self.linear = self.angular = (0.0, 0.0, 0.0)
 
-    def advance_joints(
-        self, positions: Sequence[float], linear: Vector, angular: Vector, period_s: float
-    ) -> tuple[float, ...]:
-        """Return the joint positions after a period at the twist, which the present velocity approaches."""
+    def change_twist(self, linear: Vector, angular: Vector, period_s: float) -> None:
+        """Bring the present velocity closer to a twist, within the limits of the tip."""
         limits = self._limits
         self.linear = _toward(
             self.linear, _clamped(linear, limits.linear_velocity), limits.linear_acceleration * period_s
@@ -72,6 +73,12 @@ class TwistMotion:
         self.angular = _toward(
             self.angular, _clamped(angular, limits.angular_velocity), limits.angular_acceleration * period_s
         )
+
+    def advance_joints(
+        self, positions: Sequence[float], linear: Vector, angular: Vector, period_s: float
+    ) -> tuple[float, ...]:
+        """Return the joint positions after a period at the twist, which the present velocity approaches."""
+        self.change_twist(linear, angular, period_s)
         self.held_by = -1
         if self.rests:
             return tuple(positions)
@@ -96,6 +103,17 @@ class TwistMotion:
             return 0.0
         brake = self._limits.acceleration[index] / 2
         return min(self._limits.velocity[index], math.sqrt(2 * brake * left), left / period_s)
+
+
+def approach(way: Vector, acceleration: float, period_s: float) -> Vector:
+    """Return the velocity toward a point that is `way` off, from which a motion can stop there."""
+    brake, length = _BRAKING * acceleration, math.hypot(*way)
+    # Near the point the velocity is proportional to the way, because a period is too long for more.
+    near = brake * (2 * period_s) ** 2
+    speed = length / (2 * period_s) if length < near else math.sqrt(2 * brake * (length - near / 2))
+    x, y, z = way
+    scale = speed / max(length, 1e-12)
+    return x * scale, y * scale, z * scale
 
 
 def _clamped(vector: Vector, most: float) -> Vector:

@@ -27,6 +27,7 @@ WITHOUT_MOTION = {
     "koch",
     "wave",
     "open_manipulator_x_space",
+    "koch_leads_open_manipulator_x",
 } | {
     *("bioloid_torso_keyframes", "stand_up")  # theirs are in their own files
 }

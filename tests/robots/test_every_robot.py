@@ -27,7 +27,12 @@ def test_every_robot_compiles_and_has_motions(path):
     assert [w.what for w in compiled.warnings if not w.what.startswith(ODD_TWIN)] == []
     # motions of poses are in the robot file; others play the motions of the robots that they include
     others = {"bioloid_torso_imu", "bioloid_torso_keyframes", "single_joint_feed_forward", "stand_up"}
-    others |= {"leader_follower_two_ports", "open_manipulator_x_space", "wave"}
+    others |= {
+        "koch_leads_open_manipulator_x",
+        "leader_follower_two_ports",
+        "open_manipulator_x_space",
+        "wave",
+    }
     assert path in {command_of(motion).robot for motion in MOTIONS} or path.stem in others
 
 
