@@ -13,6 +13,7 @@ from dxlrun.contract.controller import Interfaces as Interfaces
 from dxlrun.contract.controller import JointLimits as JointLimits
 from dxlrun.contract.controller import Mismatch as Mismatch
 from dxlrun.contract.controller import Outcome as Outcome
+from dxlrun.contract.controller import RegisterChange as RegisterChange
 from dxlrun.contract.controller import RobotModel as RobotModel
 from dxlrun.contract.controller import SpeedPeak as SpeedPeak
 from dxlrun.contract.hookspecs import CONTRACT_VERSION as CONTRACT_VERSION

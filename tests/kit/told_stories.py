@@ -18,8 +18,9 @@ Expected are each goal that ends, events (`=> event arm turns...`, `=> no event 
 shafts, deg from the reference, and columns of the log: `=> position elbow from 1.5 to 2: 0.29 to 0.31`, with
 `spread` before the numbers for the difference of the largest and the smallest one, and `step` for the largest
 one of neighbours. Without a time it is the last cycle. `=> topic /pid/state: 0 to 30` is about the ms between
-its messages. `...` stands for any text. Each run is equal to its replay. `needs physics` names an extra. A
-case may have several runs: by `NAME = a | b` its `NAME` stands for one text after the other.
+its messages. `=> wrote 1 led: 1 0` has the values that a servo was sent, by the ledger. `...` stands for any
+text. Each run is equal to its replay. `needs physics` names an extra. A case may have several runs: by
+`NAME = a | b` its `NAME` stands for one text after the other.
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ import yaml
 from tests.kit.cases import Line, TextCase, read_cases
 from tests.kit.clients import Ask, clients_of
 from tests.kit.line_faults import turn_by_hand
+from tests.kit.wire import all_writes
 
 from dxlrun.channels.answers import Completion
 from dxlrun.channels.event_records import EventCode
@@ -50,6 +52,7 @@ from dxlsim.faults.fault import parse_fault
 from dxlsim.faults.kinds import KINDS
 from dxlsim.faults.script import FaultScript
 from dxlsim.servo.simulated_servo import SimulatedServo
+from dxlwire.control_table import find_table
 
 ROBOTS = Path(__file__).parents[2] / "robots"
 LOOK_NS = 10_000_000
@@ -151,6 +154,11 @@ class Story:
                 if source == "any" or event.source in (source, "runtime")
             ]
             assert any(matches(one, text) for one in texts) == (word == "event"), texts
+        elif word == "wrote":
+            servo, _, rest = rest.partition(" ")
+            item, _, values = rest.partition(": ")
+            found = list(self._written(int(servo), item))
+            assert found == [int(value) for value in values.split()], found
         elif word == "fails":
             assert matches(f"{self.result.reason}, then {self.result.last}: {self.result.detail}", rest)
             self.result = None
@@ -168,6 +176,16 @@ class Story:
                 low - 1e-9 <= one <= high + 1e-9 or (math.isnan(one) and math.isnan(low)) for one in found
             ]
             assert all(inside), (min(found), max(found))
+
+    def _written(self, number: int, name: str) -> Iterator[int]:
+        """Yield the values of an item that a servo was sent, by the ledger."""
+        for bus in self.virtual.plan.buses:
+            for servo in bus.servos:
+                item = find_table(servo.model, bus.protocol).items[name]
+                for _, servo_id, first, data in all_writes(self.virtual.ledger.entries, bus):
+                    end = item.address + item.size - first
+                    if servo_id == number == servo.servo_id and first <= item.address and end <= len(data):
+                        yield int.from_bytes(data[item.address - first : end], "little")
 
     def values(self, column: str, name: str, match: re.Match[str]) -> Any:
         if column == "topic":

@@ -14,7 +14,7 @@ from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator, Field, StrictInt, StrictStr
 
 from dxlrun import (
     LIVE,
@@ -30,6 +30,7 @@ from dxlrun import (
     Mistake,
     Outcome,
     ParametersModel,
+    RegisterChange,
     SpeedPeak,
     Tolerance,
     nearest_turn,
@@ -85,6 +86,9 @@ class Step(ParametersModel):
     torque: dict[str, Annotated[float, Field(gt=0)]] = Field(default_factory=dict)
     """Effort limits by joint from this step on, in the unit that the model measures (Nm, A or the fraction of
     its maximum)."""
+    registers: dict[str, dict[str, StrictInt | StrictStr]] = Field(default_factory=dict)
+    """Registers by joint and item from this step on, such as gains or compliance slopes. The end of the goal
+    restores them."""
     interpolation: Literal["smooth", "linear"] = "smooth"
     """`smooth` starts and ends at rest; `linear` has a constant speed."""
 
@@ -144,8 +148,8 @@ class KeyframeParameters(ParametersModel):
             yield ("start",), f"motion {self.start} is not defined; {known}"
         for name, motion in self.motions.items():
             for number, step in enumerate(motion.steps):
-                for key, named in (("pose", step.pose), ("torque", step.torque)):
-                    for joint in named:
+                for key in ("pose", "torque", "registers"):
+                    for joint in getattr(step, key):
                         if joint not in self.joints:
                             place = ("motions", name, "steps", number, key, joint)
                             yield place, f"{joint} is {not_one_of(self.joints)}"
@@ -217,6 +221,15 @@ class KeyframeParameters(ParametersModel):
         )
         return next(steps, ())
 
+    def register_changes(self) -> Iterator[RegisterChange]:
+        """Yield each register value of the steps."""
+        for name, motion in self.motions.items():
+            for number, step in enumerate(motion.steps):
+                path = ("motions", name, "steps", number, "registers")
+                for joint, items in step.registers.items():
+                    for item, value in items.items():
+                        yield RegisterChange(joint, item, value, (*path, joint, item))
+
 
 class PlayCommand(CommandModel):
     """Goal of a keyframe_player: a motion, its speed and its repetitions."""
@@ -252,6 +265,7 @@ class KeyframePlayer(Controller[KeyframeParameters]):
             (*command, "effort") if key else command,
             asked_by={"effort": key} if key else {},
             partial=parameters.partial,
+            registers=tuple(parameters.register_changes()),
         )
 
     @classmethod
@@ -347,6 +361,8 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         """True for each joint that was skipped in a part of the goal."""
         self._stand = np.zeros(count)
         """Last measured position of each joint while it had no torque, rad."""
+        self._registers: dict[str, dict[str, int | str]] = {}
+        """Registers that the steps of this goal have set, by joint and item."""
         self._rate = 1.0
 
     def on_activate(self, time_ns: int) -> None:
@@ -356,6 +372,7 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         self._limp.fill(False)
         self._out.fill(False)
         self._goal: Goal | None = None
+        self._registers.clear()
         self._playing = self._stopping = self._leaving = False
         self._unknown = True
         self._starting = self.parameters.start is not None
@@ -392,7 +409,11 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         self._rate = self._wanted_rate()
         np.copyto(self._missed, self._limp)
         self._now.velocity /= self._rate
+        replaced = bool(self._registers)
+        self._registers.clear()
         self._next_step(softly=True)
+        if replaced:
+            self.context.set_registers(self._registers)
 
     def on_cancel(self, goal: Goal, time_ns: int) -> None:
         """Decelerate each joint to rest, or first complete a motion that loops or has an exit. The goal ends
@@ -529,7 +550,16 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         self._order = LINEAR if step.interpolation == "linear" and not softly else CUBIC
         solve(self._order, self._step_s, start, end, self._piece[: self._order])
         np.copyto(self.context.commands.effort, torque, where=np.isfinite(torque))
+        if step.registers:
+            for joint, items in step.registers.items():
+                self._registers.setdefault(joint, {}).update(items)
+            self.context.set_registers(self._registers)
         return True
+
+    def _restore_registers(self) -> None:
+        if self._registers:
+            self._registers.clear()
+            self.context.set_registers(self._registers)
 
     def _name_of_next_step(self) -> str | None:
         """Count the steps and repetitions, and return the motion of the next step; None after the last one.
@@ -553,6 +583,7 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         self._write_commands()
         if self._time_s >= self._stop.duration_s:
             self._stopping = False
+            self._restore_registers()
             self._finish(Outcome.CANCELLED, f"stopped in step {self._number} of {self._name}")
 
     def _write_commands(self) -> None:
@@ -573,6 +604,7 @@ class KeyframePlayer(Controller[KeyframeParameters]):
 
         A cancelled goal ends without judgement.
         """
+        self._restore_registers()
         if self._leaving:
             self._finish(Outcome.CANCELLED, f"played {self._name}")
             return

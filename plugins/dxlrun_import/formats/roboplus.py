@@ -10,18 +10,18 @@ are the slopes 2..128].
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 from dxlrun.tooling.files import Conversion, FileContent, FileFormat, ImportOptions
 from dxlrun_import.checked_values import refused, valid_name
-from dxlrun_import.formats.roboplus_pages import BY_HAND, MotionPage, read_pages
+from dxlrun_import.formats.roboplus_pages import BY_HAND, USUAL_COMPLIANCE, MotionPage, read_pages
 from dxlrun_import.robot_draft import DraftBus, JointDraft, RobotDraft, wrapped
 
 MIDDLE, STEP_DEG = 512, 300 / 1023  # of an AX-12
 SPEED_DEG = 300.0  # mean speed: the peak of a cubic is 1.5 times as high, and an AX-12 reaches 472 deg/s
 SHORTEST_S = 0.01  # of a step of a keyframe_player
 _UNMOVED = 0x4000
-_USUAL_COMPLIANCE, _COMPLIANCES = 5, range(1, 8)
+_COMPLIANCES = range(1, 8)
 
 
 def convert(content: FileContent, options: ImportOptions) -> Conversion:
@@ -37,7 +37,8 @@ def convert(content: FileContent, options: ImportOptions) -> Conversion:
                 what = f"a position of ID {number} is above 1023, so it is not an AX servo"
                 raise refused(page.mark, what, BY_HAND)
         joint = JointDraft(f"joint_{number}", number, content.mark(), "AX-12A")
-        joint = joint._replace(registers=_slopes(number, used, draft))
+        if not _varies(number, used):
+            joint = joint._replace(registers=_slopes(number, used[:1], draft))
         draft.add_joint(joint._replace(comment="guessed: name, model, direction"))
     for page in used:
         name = valid_name(page.title) if page.title else f"page_{page.number}"
@@ -52,7 +53,8 @@ def convert(content: FileContent, options: ImportOptions) -> Conversion:
         before = [
             one for one in used if page in (one.follower, one.exit) or (one is page and page.param[2] > 1)
         ]
-        lines += _motion(page, ids, [one.steps[-1] for one in before], draft)
+        slopes = {one: _slopes(one, [page], draft, usual=True) for one in ids if _varies(one, used)}
+        lines += _motion(page, ids, [one.steps[-1] for one in before], slopes, draft)
     draft.controllers = lines
     return draft.conversion()
 
@@ -73,24 +75,32 @@ def _set_exit(page: MotionPage, leaves: MotionPage | None, draft: RobotDraft) ->
         draft.remarks.append(f"page {page.name}: its exit page {int(page.param[1])}, which leads back to it")
 
 
-def _slopes(number: int, used: Sequence[MotionPage], draft: RobotDraft) -> dict[str, int]:
-    """Return the registers for the compliance of a joint, if all pages have the same unusual one."""
-    found = sorted({page.compliance[number] for page in used if number < len(page.compliance)})
-    if found in ([], [_USUAL_COMPLIANCE]):
+def _varies(number: int, used: Sequence[MotionPage]) -> bool:
+    """Return True if pages have different compliances of a joint. Each page then sets its own."""
+    return len({page.compliance_of(number) for page in used}) > 1
+
+
+def _slopes(
+    number: int, pages: Sequence[MotionPage], draft: RobotDraft, usual: bool = False
+) -> dict[str, int]:
+    """Return the registers for the compliance of a joint in a page; for the usual one only with `usual`."""
+    found = next((page.compliance_of(number) for page in pages), USUAL_COMPLIANCE)
+    if found == USUAL_COMPLIANCE and not usual:
         return {}
-    if len(found) > 1 or found[0] not in _COMPLIANCES:
-        values = ", ".join(f"{one:g}" for one in found)
-        draft.remarks.append(
-            f"joint_{number}: compliance {values} of the pages; write `registers` of the joint"
-        )
+    if found not in _COMPLIANCES:
+        draft.remarks.append(f"joint_{number}: compliance {found:g}; write `registers` of the joint")
         return {}
-    return dict.fromkeys(("cw_compliance_slope", "ccw_compliance_slope"), 1 << int(found[0]))
+    return dict.fromkeys(("cw_compliance_slope", "ccw_compliance_slope"), 1 << int(found))
 
 
 def _motion(
-    page: MotionPage, ids: Sequence[int], starts: list[list[float]], draft: RobotDraft
+    page: MotionPage,
+    ids: Sequence[int],
+    starts: list[list[float]],
+    slopes: Mapping[int, Mapping[str, int]],
+    draft: RobotDraft,
 ) -> Iterator[str]:
-    """Yield the lines of a page; `starts` are the poses from which it is reached."""
+    """Yield the lines of a page; `starts` are the poses from which it is reached, `slopes` its registers."""
     _, _, repeat, speed, _ = page.param
     if speed <= 0:
         raise refused(page.mark, f"page {page.name} has speed {speed:g}", "give it a speed above 0")
@@ -109,7 +119,16 @@ def _motion(
         if step[-1] < least:
             remarks.append(f"step {index} takes {least:g} s instead of {step[-1]:g} s, as fast as AX servos")
         start = f"          - {{time: {max(step[-1], least):g} s, pause: {step[-2]:g} s, pose: {{"
-        yield from wrapped(start, pose, "}}")
+        registers = [
+            f"joint_{one}: {{{', '.join(f'{item}: {value}' for item, value in written.items())}}}"
+            for one, written in slopes.items()
+            if written
+        ]
+        if index == 1 and registers:
+            yield from wrapped(start, pose, "},")
+            yield from wrapped("             registers: {", registers, "}}")
+        else:
+            yield from wrapped(start, pose, "}}")
         starts = [step]
     draft.remarks += [f"page {page.name}: {remark}" for remark in remarks]
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from dxlrun.tooling.files import FileContent, Mark
 from dxlrun_import.checked_values import refused
 
+USUAL_COMPLIANCE = 5  # of a slope of 32, the default of an AX-12
 BY_HAND = "write its motions by hand; docs/how-to/import.md"
 
 
@@ -25,6 +26,10 @@ class MotionPage:
     name: str = ""
     follower: MotionPage | None = None
     exit: MotionPage | None = None
+
+    def compliance_of(self, servo_id: int) -> float:
+        """Return the compliance of a servo on this page; the usual one if the page has none."""
+        return self.compliance[servo_id] if servo_id < len(self.compliance) else USUAL_COMPLIANCE
 
 
 def read_pages(content: FileContent) -> tuple[list[float], list[MotionPage]]:

@@ -16,6 +16,7 @@ from msgspec.structs import replace
 from pydantic import ValidationError
 
 from dxlrun.compile.controller_graph import Mistake
+from dxlrun.contract.controller import RegisterChange
 from dxlrun.control.controllers.offers import Breach
 from dxlrun.control.controllers.plugin_loading import Offer, PlugIns, interfaces_breach, mismatches
 from dxlrun.control.controllers.single_files import is_of_file
@@ -24,7 +25,7 @@ from dxlrun.description.document import KeyPath
 from dxlrun.description.mistakes.ros_types import ros_type
 from dxlrun.description.robot import ControllerEntry
 from dxlrun.errors import suggestion
-from dxlrun.plan.loop_plan import ControllerPlan, JointPlan
+from dxlrun.plan.loop_plan import ControllerPlan, JointPlan, RegisterPlan
 from dxlwire.modes import CommandName
 
 _OFFERED = (
@@ -55,6 +56,7 @@ class CompiledController(msgspec.Struct, frozen=True):
     motors: tuple[str, ...] = ()  # figures of its joints' motors that it needs
     asked_by: Mapping[CommandName, KeyPath] = {}
     """Path of the parameter that made the controller claim a command interface; see `Interfaces.asked_by`."""
+    registers: tuple[RegisterChange, ...] = ()  # registers that it may write during a run
 
 
 class PlugInCode(NamedTuple):
@@ -206,9 +208,14 @@ def compile_entry(
         source_commands=interfaces.source_commands,
         takeovers=interfaces.takeovers,
         partial=interfaces.partial,
+        registers=tuple(
+            dict.fromkeys(RegisterPlan(one.joint, one.item, one.value) for one in interfaces.registers)
+        ),
         topics=tuple(f"/{plan.name}/{topic}" for topic in topics),
     )
-    return CompiledController(plan, offer, parameters, interfaces.motors, interfaces.asked_by)
+    return CompiledController(
+        plan, offer, parameters, interfaces.motors, interfaces.asked_by, interfaces.registers
+    )
 
 
 def require_fit(controller: CompiledController, joints: Sequence[JointPlan], urdf: str | None) -> None:

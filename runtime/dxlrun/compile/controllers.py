@@ -6,6 +6,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import TypeVar
 
 import numpy as np
+from msgspec.structs import replace
 from pydantic import ValidationError
 
 from dxlrun.channels.cycle import MOST_CONTROLLERS
@@ -20,7 +21,10 @@ from dxlrun.compile.controller_entry import (
 )
 from dxlrun.compile.controller_graph import ControllerGraph
 from dxlrun.compile.joints.compiled_joints import CompiledJoint
+from dxlrun.compile.joints.compiled_servos import SettingsStage
+from dxlrun.compile.joints.described_servos import used_features
 from dxlrun.compile.joints.limits import report_speed
+from dxlrun.compile.joints.register_values import UnfitRegister
 from dxlrun.compile.problems import RobotFile, into_mark, joint_mark
 from dxlrun.contract.controller import SpeedPeak
 from dxlrun.control.controllers.claims import claimed_modes, start_modes
@@ -34,7 +38,10 @@ from dxlrun.description.mistakes.ros_types import ros_type
 from dxlrun.description.reading import Description
 from dxlrun.description.robot import ControllerEntry
 from dxlrun.errors import Mark
-from dxlrun.plan.loop_plan import ControllerPlan
+from dxlrun.features import stages
+from dxlrun.plan.loop_plan import ControllerPlan, RegisterPlan
+from dxlrun.plan.mechanics_plan import MechanicsPlan
+from dxlwire.bus_plan import BusPlan
 from dxlwire.modes import Mode, mode_of
 from dxlwire.plan.mode_plan import LACKS, controls_speed, model_modes
 
@@ -301,6 +308,45 @@ def check_motions(
 
 def _names_motor(joint: CompiledJoint) -> bool:
     return any(servo.described.motor is not None for servo in joint.servos)
+
+
+def compile_registers(
+    file: RobotFile,
+    joints: Mapping[str, CompiledJoint],
+    buses: Sequence[BusPlan],
+    mechanics: MechanicsPlan,
+    controllers: Mapping[str, CompiledController],
+) -> tuple[ControllerPlan, ...]:
+    """Return the plans of the controllers with the register writes of each servo.
+
+    A register that a servo lacks, or that must not change during a run, is a problem of the file.
+    """
+    rows = {servo.own_name: servo.row for bus in buses for servo in bus.servos}
+    first = len(joints) if mechanics.coupled else 0  # rows of servos follow those of joints
+    stages_of_settings = stages(SettingsStage, used_features(file.description))
+    change = next(stage.change for _, stage in stages_of_settings if stage.change)
+    plans: list[ControllerPlan] = []
+    for name, controller in controllers.items():
+        writes: dict[RegisterPlan, dict[int, int]] = {}
+        for one in controller.registers:
+            mark = _entry_mark(file.description, ("controllers", name, *one.at))
+            found = writes.setdefault(RegisterPlan(one.joint, one.item, one.value), {})
+            if one.joint not in controller.plan.joints:
+                what = f"{name} sets registers of {one.joint}, which is not one of its joints"
+                file.error(mark, what, f"add {one.joint} to its joints")
+            for servo in joints[one.joint].servos if one.joint in joints else ():
+                try:
+                    raw = change(servo.table, one.item, one.value).value
+                    found[first + rows.get(servo.described.name, 0)] = raw
+                except UnfitRegister as error:
+                    if servo.certain:
+                        file.error(mark, f"{servo.described.title}: {error.what}", error.fix)
+                except ValueError as error:
+                    what, _, fix = str(error).partition("; ")
+                    file.error(mark, f"{one.item} of {servo.described.title}: {what}", fix)
+        registers = (replace(plan, writes=tuple(found.items())) for plan, found in writes.items())
+        plans.append(replace(controller.plan, registers=tuple(registers)))
+    return tuple(plans)
 
 
 def compile_modes(

@@ -16,6 +16,7 @@ from dxlrun.compile.controllers import (
     check_robot,
     compile_controllers,
     compile_modes,
+    compile_registers,
     read_controller_files,
 )
 from dxlrun.compile.joints.compiled_joints import (
@@ -185,9 +186,10 @@ def compile_robot(
     simulation = compile_simulation(file, joints, devices, motors)
     poses = compile_poses(file, joints, by_feature)
     controllers = compile_controllers(file, plugins, contributions, poses)
-    states = {one.name: one.states for one in sources}
-    states |= {name: one.plan.provides for name, one in controllers.items() if one.plan.provides}
-    frames = compile_frames(file, body, states)
+    providers = {one.name: one.states for one in sources} | {
+        name: one.plan.provides for name, one in controllers.items() if one.plan.provides
+    }
+    frames = compile_frames(file, body, providers)
     if body is not None:
         check_orientations(file, body.urdf, frames, contributions, controllers)
     check_source_names(file, by_feature, (one.plan for one in controllers.values()))
@@ -195,8 +197,9 @@ def compile_robot(
     check_tolerances(file, joints, (one.plan for one in controllers.values()))
     check_robot(file, joints, urdf, controllers)
     check_motions(file, joints, controllers)
-    modes = compile_modes(file, joints, controllers)
-    buses = compile_buses(file, joints, contributions, modes)
+    buses = compile_buses(file, joints, contributions, compile_modes(file, joints, controllers))
+    mechanics = next((each.mechanics for each in contributions if each.mechanics), MechanicsPlan())
+    planned = compile_registers(file, joints, buses, mechanics, controllers)
     policy_keys = [one for _, one in stages(PolicyKey, features) if one.does]
     policies = compile_policies(file, joints, buses, policy_keys, poses)
     parts: list[MotionPart] = []
@@ -215,7 +218,7 @@ def compile_robot(
         period_ns=round(1e9 / settings.rate),
         scheduler=_scheduler_plan(settings),
         joints=tuple(joint.plan for joint in joints.values()),
-        controllers=tuple(controller.plan for controller in controllers.values()),
+        controllers=planned,
         commands=tuple(
             sorted((each for part in parts for each in part.commands), key=lambda each: each.at_ns)
         ),
@@ -258,7 +261,7 @@ def compile_robot(
         | {package: name for each in contributions for package, name in each.packages.items()}
         | _physics(simulation, buses)
         | _packages(features),
-        mechanics=next((each.mechanics for each in contributions if each.mechanics), MechanicsPlan()),
+        mechanics=mechanics,
     )
     return CompiledRobot(plan, file.warnings, settings.rate, tuple(joints.values()), tuple(parts), shown)
 

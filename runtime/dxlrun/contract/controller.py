@@ -40,6 +40,18 @@ class Live(msgspec.Struct, frozen=True):
 LIVE: Final = Live()
 
 
+class RegisterChange(msgspec.Struct, frozen=True):
+    """Value that a controller may write into a register of a joint's servos during a run."""
+
+    joint: str
+    item: str
+    """Item of the control table, in the RAM."""
+    value: int | str
+    """Integer on the wire, or a quantity with its unit."""
+    at: tuple[str | int, ...] = ()
+    """Path in the parameters, to which errors about the register refer."""
+
+
 class Interfaces(msgspec.Struct, frozen=True):
     """Interfaces that a controller requires and offers, depending on its parameters.
 
@@ -69,6 +81,7 @@ class Interfaces(msgspec.Struct, frozen=True):
         partial: True if the controller continues with its other joints after clients have disabled the torque
             of some, and if it may be activated without them. Commands for joints without torque have no
             effect; `states.unable` returns them.
+        registers: All values that it passes to `Context.set_registers`, each checked before a run.
     """
 
     joints: tuple[str, ...]
@@ -81,6 +94,7 @@ class Interfaces(msgspec.Struct, frozen=True):
     takeovers: tuple[str, ...] = ()
     asked_by: Mapping[CommandName, tuple[str | int, ...]] = msgspec.field(default_factory=dict)
     partial: bool = False
+    registers: tuple[RegisterChange, ...] = ()
 
     @property
     def source_commands(self) -> tuple[str, ...]:
@@ -256,6 +270,10 @@ def _end_nothing(why: str) -> None:
     raise ControllerFault("requested the end of the run outside of a run")
 
 
+def _set_no_registers(values: Mapping[str, Mapping[str, int | str]]) -> None:
+    raise ControllerFault("set registers outside of a run")
+
+
 def _keep_nothing(state: bytes) -> None:
     raise ControllerFault("kept a state without `keeps = True`; set it in the controller's class")
 
@@ -331,6 +349,12 @@ class Context(msgspec.Struct, frozen=True):
     with conflicting claims leave, and so do the ones above these. Controllers that enter are updated in the
     same cycle, unless their joints must change their modes first. Active ones stay active. An event reports
     the takeover or its refusal."""
+    set_registers: Callable[[Mapping[str, Mapping[str, int | str]]], None] = _set_no_registers
+    """Set registers of the joints' servos, by joint and item, to values in `Interfaces.registers`.
+
+    They are written in the idle time of the next cycles, also to a servo that returns after a loss or a
+    reboot. A register that it set before and that is not named now gets the value from before, and so does
+    each one when the controller leaves. Events report what was written."""
     end_run: Callable[[str], None] = _end_nothing
     """Request the end of the run after this cycle by the policy `on_fault`, with a reason as text."""
 

@@ -253,7 +253,9 @@ class ControlLoop:
     def _wind_up(self, name: str) -> Last:
         """Execute the steps of an exit policy in additional cycles; return the final state, limp or hold."""
         policy = self.plan.policies.named(name)
-        motion = SafeMotion(policy, self.context)
+        # After a fault, torque off does not wait for registers.
+        stand_ns = self.manager.registers.time_left_ns if name == "on_exit" else 0
+        motion = SafeMotion(policy, self.context, stand_ns)
         if not motion.over:
             self._log_policy(name, policy.text)
             if self.steering.paused_until_ns:

@@ -45,6 +45,8 @@ class SafeMotion:
 
     policy: Policy
     context: ControlContext
+    stand_ns: int = 0
+    """Shortest time before the first step, in which registers of the servos are restored."""
     record: CycleRecord = field(init=False)
     joints: tuple[JointPlan, ...] = field(init=False)
     over: bool = field(default=False, init=False)
@@ -81,6 +83,8 @@ class SafeMotion:
         holds = self.policy.last == "hold"
         self._stand_ns = STAND_NS + round(min(max(stops_s) * 1e9, limit_ns) if holds else 0)
         standing_ns = self._stand_ns if holds and (Mode.VELOCITY in now or max(stops_s) > 0) else 0
+        if self.stand_ns:
+            self._stand_ns = standing_ns = max(self._stand_ns, min(self.stand_ns, limit_ns))
         self._wait_ns = max(MODES_NS if self._modes.any() else 0, standing_ns)
         # A joint with an acceleration limit must know its final target to brake in time.
         self._reach = np.array([1.0 if joint.acceleration is None else np.inf for joint in self.joints])

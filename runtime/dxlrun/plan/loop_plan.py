@@ -284,6 +284,16 @@ class SourcePlan(msgspec.Struct, frozen=True):
     """SI units of commands by name."""
 
 
+class RegisterPlan(msgspec.Struct, frozen=True):
+    """Value that a controller may write into a register of a joint's servos."""
+
+    joint: str
+    item: str
+    value: int | str  # As in the robot file
+    writes: tuple[tuple[int, int], ...] = ()
+    """Row (`Hardware.write_register`) and integer on the wire of each servo."""
+
+
 class ControllerPlan(msgspec.Struct, frozen=True):
     """Compiled entry of one controller in the robot file."""
 
@@ -310,6 +320,7 @@ class ControllerPlan(msgspec.Struct, frozen=True):
     """Commands of sources that it claims: `light/led`. Logs have the name of the first kind of source."""
     takeovers: tuple[str, ...] = ()  # Controllers whose takeover it may request
     partial: bool = False  # It continues with the other joints while some have no torque
+    registers: tuple[RegisterPlan, ...] = ()  # Registers that it may write, and their values
 
     @property
     def commands_servos(self) -> bool:

@@ -363,6 +363,8 @@ class Preparation:
                     omitted=self.omitted,
                 )
                 require_fit(found, [self.joints[joint] for joint in found.plan.joints], self.urdf)
+            if found.registers:
+                raise invalid(texts.registers_loaded(plan.name))
         except ValidationError as error:
             raise invalid(mistakes(error, plan.name, model)) from error
         except WrongEntry as wrong:

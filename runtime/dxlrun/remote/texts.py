@@ -178,6 +178,10 @@ def active_at_once(controller: str) -> str:
     return f"controllers are loaded inactive; load {controller} first, then switch to it"
 
 
+def registers_loaded(controller: str) -> str:
+    return f"{controller} changes registers, so it cannot be loaded; write it into the robot file"
+
+
 def parameter_parts(parts: Sequence[str]) -> str:
     return f"name one of its values: {', '.join(parts)}"
 

@@ -30,6 +30,7 @@ from dxlrun.contract.controller import Context, Controller, JointLimits, Outcome
 from dxlrun.control import texts
 from dxlrun.control.context import ControlContext
 from dxlrun.control.controllers.activity import Activity
+from dxlrun.control.controllers.changed_registers import ChangedRegisters
 from dxlrun.control.controllers.goal_registry import CurrentCommands, RunningGoal
 from dxlrun.control.controllers.keeping import StateKeeper
 from dxlrun.control.controllers.live_parameters import LiveValues, with_values
@@ -101,6 +102,7 @@ class ControllersContext(msgspec.Struct, frozen=True, kw_only=True):
     topics: TopicLog
     """Destination of the controllers' messages."""
     keeping: StateKeeper
+    registers: ChangedRegisters
     requests: list[ControllerRequest]
     """Takeovers and ends of the run that controllers requested in this cycle; not executed yet."""
 
@@ -159,6 +161,7 @@ class ManagedController:
         self._divider = plan.every
         self._nominal_ns = plan.every * context.run.schedule.period_ns
         self._last_ns = -1
+        self._set_registers = context.registers.open_setter(plan)
         self._context = self._new_context([joints[row] for row in self.rows])
 
     def _new_context(self, joints: Sequence[JointPlan]) -> Context:
@@ -193,6 +196,7 @@ class ManagedController:
             urdf=run.plan.urdf,
             provided=np.zeros(0) if self.provided is None else self.provided.own,
             source_commands=self._outputs.source_commands,
+            set_registers=self._set_registers,
             take_over=partial(_take_over, requests, plan),
             end_run=partial(_end_run, requests, plan),
         )
@@ -237,6 +241,8 @@ class ManagedController:
         self.failed |= event is ControllerEvent.FAULT
         if before and self.state is not State.ACTIVE:  # another controller may own the arrays otherwise
             self._outputs.withdraw()
+            if self.plan.registers:
+                self._set_registers({})
         if self.active:
             self._record.active |= self._bit
         else:

@@ -17,6 +17,7 @@ from dxlrun.contract.controller import Controller, Outcome
 from dxlrun.control import texts
 from dxlrun.control.context import ControlContext
 from dxlrun.control.controllers.activity import Activity
+from dxlrun.control.controllers.changed_registers import ChangedRegisters
 from dxlrun.control.controllers.claims import conflicts
 from dxlrun.control.controllers.goal_registry import (
     CurrentCommands,
@@ -69,6 +70,8 @@ class Manager:
         self._command_log = context.command_log
         self._topics = topics or TopicLog(context.record)
         self._keeping = StateKeeper(kept or KeptStates(), self._topics, context.events)
+        self.registers = ChangedRegisters(context)
+        """Registers of the servos that controllers change."""
         self._requests: list[ControllerRequest] = []
         """Takeovers and ends of the run that controllers requested in this cycle; not executed yet."""
         self._shared = ControllersContext(
@@ -77,6 +80,7 @@ class Manager:
             activity=activity or Activity(),
             topics=self._topics,
             keeping=self._keeping,
+            registers=self.registers,
             requests=self._requests,
         )
         self._schedule = context.schedule
@@ -129,6 +133,8 @@ class Manager:
             cycle: Number of the cycle: periods since the first deadline, without pauses.
         """
         self._goals.time_ns = self._schedule.time_ns
+        if self.registers.waiting:
+            self.registers.retry()
         self._dispatch_due()
         now_ns, took_ns = self._clock.now_ns, self._record.controller_ns
         # A controller that entered by a request is updated in this cycle too, and may request one itself.

@@ -185,7 +185,9 @@ class _Remover:
         """Return True if a mapping has joints as keys: `pose: {elbow: 10 deg}`, or `p: {elbow: 3.0}`."""
         if path[-1:] in {(key,) for key in NAMING} or (len(path) == 2 and path[0] == _POSES):
             return True
-        plain = not any(isinstance(item, dict | list) for item in value.values())
+        plain = path[-1:] == ("registers",) or not any(
+            isinstance(item, dict | list) for item in value.values()
+        )
         return plain and len(path) > 2 and all(key in self._joints for key in value)
 
     def _items(self, value: list[object], path: KeyPath, place: KeyPath) -> list[object]:
