@@ -25,6 +25,8 @@ from dxlrun import DxlrunError, GoalState, GoalTimeout, RemoteRobot, connect, ru
 from dxlrun.cli.verb_registry import GROUPS
 from dxlrun.remote.sockets import SocketLink
 
+pytestmark = pytest.mark.long
+
 ROOT = Path(__file__).parents[2]
 PAGE = page_text("steering.md")
 TORSO = ROOT / "robots" / "bioloid_torso.yaml"

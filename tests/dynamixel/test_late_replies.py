@@ -227,7 +227,7 @@ def draw_pairs(
     return every if amount >= len(every) else chance.sample(every, int(amount))
 
 
-@campaign(ci=40, night=400, release=EVERY_PAIR)
+@campaign(ci=15, night=400, release=EVERY_PAIR)
 @pytest.mark.parametrize("protocol", MODELS)
 @pytest.mark.parametrize("program", PROGRAMS)
 def test_late_doubled_and_lost_replies_change_no_reported_value(

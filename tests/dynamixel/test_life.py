@@ -107,7 +107,7 @@ def test_torque_that_was_read_before_a_servo_was_let_go_gives_it_no_goals():
     assert rig.torque() == [True, False, True]
 
 
-@campaign(ci=6, night=40, release=300)
+@campaign(ci=3, night=40, release=300)
 @pytest.mark.parametrize("protocol", [1.0, 2.0])
 def test_faults_in_random_order_cause_only_legal_transitions(number, protocol, chance):
     """And no goal goes to a servo whose torque was not read as on since the last doubt."""

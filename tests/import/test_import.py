@@ -16,6 +16,8 @@ from dxlrun.contract.hookspecs import HookSpecs
 from dxlrun.description.other_files import file_formats
 from dxlrun_import.registry import FORMATS
 
+pytestmark = pytest.mark.long
+
 TEXTS = [f"../import/{path.name}" for path in sorted(Path(__file__).parent.glob("*.txt"))]
 
 

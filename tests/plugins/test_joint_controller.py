@@ -285,12 +285,11 @@ FIRST_WORDS = {
     "print": "print('here')",
     "a log record": "__import__('logging').warning('here')",
     "a warning of numpy": "np.log(np.zeros(2) - 1)",
-    "a complex number": "np.zeros(2) + np.array([1j, 0])",
 }
 
 
 @pytest.mark.parametrize(
-    ("word", "to"), [*((word, "pipe") for word in FIRST_WORDS), ("print", "file"), ("print", "terminal")]
+    ("word", "to"), [("print", "terminal"), ("a log record", "pipe"), ("a warning of numpy", "file")]
 )
 def test_the_first_output_of_a_controller_starts_no_thread_in_its_call(
     written: Written, word: str, to: str

@@ -103,14 +103,7 @@ MOVE = Ask(1.0, "mover", "positions", COMMANDS["positions"])
 
 @pytest.mark.parametrize(
     ("rate", "kind"),
-    [
-        (1, "positions"),
-        (1, "posvel"),
-        (10, "positions"),
-        (50, "positions"),
-        (50, "posvel"),
-        (500, "positions"),
-    ],
+    [(1, "positions"), (10, "positions"), (50, "posvel"), (500, "positions")],
 )
 @pytest.mark.parametrize("protocol", [1.0, 2.0])
 def test_the_shaft_is_never_faster_than_the_limit(tmp_path, shaft, protocol, rate, kind):
@@ -150,7 +143,7 @@ def test_a_servo_that_lost_its_profile_by_a_reset_is_not_faster_either(tmp_path,
     ("law", "kind", "most", "beyond"),
     [("effort", "efforts", 1.2, 0.07), ("pwm", "pwm", 1.0, 0.07), ("velocity", "velocities", 4.0, 0.01)],
 )
-@pytest.mark.parametrize(("inertia", "rate"), [(0.0005, 50), (0.002, 100), (0.02, 50), (0.06, 100)])
+@pytest.mark.parametrize(("inertia", "rate"), [(0.0005, 50), (0.06, 100)])
 def test_a_joint_that_is_driven_outward_stops_at_its_limit(  # noqa: PLR0917  its cases
     tmp_path, shaft, inertia, rate, law, kind, most, beyond, side
 ):

@@ -5,8 +5,9 @@ all of them; their servos lose torque, and each shaft is turned by 100 deg. When
 shafts are watched, then clients command again. Robots of pairs of servos and of differentials have a joint,
 or two, for each mode.
 
-Left out because they can tell nothing new: a gear, a pair or a differential with a return in a pause, with a
-line or after a requested reboot, as these lead to the same return, and Protocol 1.0 with a pause.
+Every way runs with plain joints, and every robot returns after a brown-out. Omitted is what leads to the same
+return: a pause, a line or a requested reboot of other joints; all else of a gear; all but a request of
+Protocol 1.0; a request of pairs.
 """
 
 from __future__ import annotations
@@ -413,7 +414,7 @@ def activated(story: Story, ms: float) -> None:
     story.at(ms + 1, lambda: story.watch(story.all_have_torque, again))
 
 
-@way("start")
+@way("start", ("plain", *COUPLED))
 def _(story: Story) -> None:
     for name in story.names:
         if name not in story.put:
@@ -429,7 +430,7 @@ def _(story: Story) -> None:
     turned(story)
 
 
-@way("return with the port", ("plain", "protocol 1"))
+@way("return with the port", ("plain",))
 def _(story: Story) -> None:
     faults(story, f"brownout at={LOST_MS}ms for=300ms")
     faults(story, f"unplug at={LOST_MS}ms for=400ms")
@@ -442,18 +443,14 @@ def _(story: Story) -> None:
     activated(story, TURNED_MS)
 
 
-@way("torque that a client requests", ("plain", "protocol 1", *COUPLED))
+@way("torque that a client requests", ("plain", "protocol 1", "differential"))
 def _(story: Story) -> None:
     story.at(LOST_MS, lambda: story.ask("torque", joints=story.joints, on=False, release=True))
     activated(story, TURNED_MS)
     story.at(TURNED_MS + 100, lambda: story.ask("torque", joints=story.joints, on=True))
 
 
-@way(
-    "torque that a client requests while controllers are active",
-    ("plain", "geared", "protocol 1"),
-    policy="limp",
-)
+@way("torque that a client requests while controllers are active", ("plain", "protocol 1"), policy="limp")
 def _(story: Story) -> None:
     faults(story, f"brownout at={LOST_MS}ms for=300ms")
     turned(story)
@@ -481,7 +478,7 @@ def _(story: Story) -> None:
     story.at(TURNED_MS + 1, lambda: story.watch(story.all_have_torque, go_on))
 
 
-@way("another mode")
+@way("another mode", ("plain", *COUPLED))
 def _(story: Story) -> None:
     leave = [name for one in story.ways for name in one.controllers]
     story.at(LOST_MS, lambda: story.ask("switch", activate=["velocity", "position"], deactivate=leave))

@@ -31,9 +31,9 @@ def dxlrun(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, 
     return command_line(capsys)
 
 
-def robot_file(folder: Path, name: str) -> Path:
+def robot_file(folder: Path, name: str, more: str = "") -> Path:
     path = folder / f"{name}.yaml"
-    path.write_text(ROBOT.replace("name: pair", f"name: {name}", 1) + POSE)
+    path.write_text(ROBOT.replace("name: pair", f"name: {name}", 1) + more)
     return path
 
 
@@ -49,7 +49,7 @@ def pan_goals(running: Running) -> list[int]:
 def test_stop_leaves_a_run_that_is_already_ending_its_pose(
     dxlrun: Dxlrun, start: Start, tmp_path: Path
 ) -> None:
-    runs = {name: start(robot=robot_file(tmp_path, name)) for name in ("bare_arm", "bare_leg")}
+    runs = {name: start(robot=robot_file(tmp_path, name, POSE)) for name in ("bare_arm", "bare_leg")}
     for running in runs.values():
         running.wait_until_moving()
     listed = dxlrun("list").err

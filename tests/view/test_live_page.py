@@ -220,7 +220,7 @@ def test_a_robot_that_ends_and_comes_back(live: LiveRobot, serve: Serve, run: Ru
     assert after[-1]["time"] > before[-1]["time"]
 
 
-def test_a_robot_that_does_not_run_is_waited_for(run: Run) -> None:
+def test_a_robot_that_does_not_run_is_waited_for() -> None:
     robot = LiveRobot("nowhere")
     shown = robot.describe_page()
     robot.close()

@@ -24,6 +24,8 @@ from dxlrun.output.target import new_target
 from dxlrun.testing import simulated_robot
 from dxlrun_analysis.export.arrow_tables import WITHOUT_TABLE, tables_of
 
+pytestmark = pytest.mark.long
+
 FORMATS = ["csv", "parquet", "lerobot"]
 
 

@@ -23,6 +23,8 @@ from dxlrun.testing import simulated_robot
 from dxlrun_analysis.export.episodes import Choice
 from dxlrun_analysis.export.lerobot import write_dataset
 
+pytestmark = pytest.mark.long
+
 LEROBOT = os.getenv("DXLRUN_LEROBOT_PYTHON", "")
 
 

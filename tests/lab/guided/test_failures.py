@@ -24,6 +24,8 @@ from dxlrun_lab.guided.segment import Guard, Segment
 from dxlsim.faults.fault import parse_fault
 from dxlsim.faults.script import FaultScript
 
+pytestmark = pytest.mark.long
+
 
 def interrupted(rig: Any, act: Callable[[], object]) -> Segments:
     """Return two segments, in the second of which something happens after half a second."""
