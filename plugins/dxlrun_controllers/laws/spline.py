@@ -38,6 +38,7 @@ A speed has at most three extremes. The end is first, so that a constant speed i
 """
 _APART = 1 / 16
 """Distance between two of the times in `_SHARES`."""
+_MULTIPLY, _ADD = np.multiply, np.add
 _STEPS = 3
 """Iterations of Newton's method for a peak speed. Each doubles the correct digits; a cubic needs only one."""
 
@@ -92,20 +93,41 @@ def solve(
     out[5] = (12 * way - 6 * (v1 + v0) * t + (a1 - a0) * t**2) / (2 * t**5)
 
 
-def evaluate(piece: Sequence[Floats] | Floats, t: float, sample: SplineSample) -> None:
-    """Write position, velocity and acceleration of a piece, `t` s after its start, into `sample` (Horner's
-    scheme).
+class Polynomial:
+    """Polynomial piece of each joint, evaluated with its derivatives by Horner's scheme.
+
+    A stage of the scheme is one array: a coefficient, and position, velocity and acceleration of the stages
+    before. Each row is multiplied by the time and gets the row above added: two calls of numpy a stage.
     """
-    position, velocity, acceleration = sample.rows
-    sample.rows.fill(0.0)
-    for coefficients in piece[::-1]:
-        acceleration *= t
-        acceleration += velocity
-        velocity *= t
-        velocity += position
-        position *= t
-        position += coefficients
-    acceleration *= 2.0
+
+    def __init__(self, joints: int) -> None:
+        self._stages = np.zeros((QUINTIC, 4, joints))
+        self._product, self._time = np.zeros((3, joints)), np.zeros(())
+        self._scheme = tuple(
+            (self._stages[k, 1:], self._stages[k, :-1], self._stages[k - 1, 1:])
+            for k in range(QUINTIC - 1, 0, -1)
+        )
+        """State of a stage, the rows that are added, and the state of the next stage."""
+        self._last_state, self._last_rows = self._stages[0, 1:], self._stages[0, :-1]
+        self._steps = self._scheme
+
+    def set_piece(self, piece: Floats) -> None:
+        """Copy the coefficients of a piece, shape (order, joints)."""
+        order = len(piece)
+        np.copyto(self._stages[:order, 0], piece)
+        self._stages[order - 1, 1:] = 0.0
+        self._steps = self._scheme[QUINTIC - order :]
+
+    def evaluate(self, t: float, sample: SplineSample) -> None:
+        """Write position, velocity and acceleration, `t` s after the start of the piece, into `sample`."""
+        multiply, add, product, time = _MULTIPLY, _ADD, self._product, self._time
+        time[()] = t  # a number of Python would be converted in each call
+        for state, rows, following in self._steps:
+            multiply(state, time, product)
+            add(product, rows, following)
+        multiply(self._last_state, time, product)
+        add(product, self._last_rows, sample.rows)
+        add(sample.acceleration, sample.acceleration, sample.acceleration)
 
 
 def peak_velocities(piece: Floats, duration: float | Floats) -> tuple[Floats, Floats]:
@@ -262,9 +284,8 @@ class Trajectory:
         self._times = np.zeros(1)
         self._first = self._last = np.zeros((3, joints))
         self._pieces = np.zeros((0, LINEAR, joints))
-        self._now: tuple[Floats, ...] = ()
-        """Coefficients of the current piece, which is valid from `_begin_s` to `_end_s` of the points' time
-        """
+        self._on_bridge, self._on_piece = Polynomial(joints), Polynomial(joints)
+        """The bridge, and the current piece, valid from `_begin_s` to `_end_s` of the points' time."""
         self._begin_s = self._end_s = 0.0
         self._tail = StopTrajectory(joints)
         self._tail_s = 0.0
@@ -293,6 +314,7 @@ class Trajectory:
                 solve(QUINTIC, self.bridge_s, start, self._beginning(order), self._bridge)
             else:
                 solve(order, self.bridge_s, start, self._first, self._bridge[:order])
+            self._on_bridge.set_piece(self._bridge)
 
     def join(
         self, data: Floats, now: SplineSample, late_s: float, blend_s: float, limits: SplineLimits
@@ -328,6 +350,7 @@ class Trajectory:
             if haste <= 1.0:
                 break
             haste *= _SHORTER
+        self._on_bridge.set_piece(self._bridge)
         self.bridge_s, self._tail_s = bridge_s, max(end_s, bridge_s)
         if bridge_s < end_s:
             self._sample_points(end_s, joined)
@@ -388,7 +411,7 @@ class Trajectory:
         at rest.
         """
         if t < self.bridge_s:
-            evaluate(self._bridge, max(t, 0.0), sample)
+            self._on_bridge.evaluate(max(t, 0.0), sample)
         elif t < self._tail_s:
             self._sample_points(t, sample)
         elif t < self.duration_s:
@@ -407,8 +430,8 @@ class Trajectory:
         if not self._begin_s <= t < self._end_s:
             index = max(min(int(self._times.searchsorted(t, side="right")), len(self._pieces)) - 1, 0)
             self._begin_s, self._end_s = float(self._times[index]), float(self._times[index + 1])
-            self._now = tuple(self._pieces[index])
-        evaluate(self._now, t - self._begin_s, sample)
+            self._on_piece.set_piece(self._pieces[index])
+        self._on_piece.evaluate(t - self._begin_s, sample)
 
 
 class SplineLimits(NamedTuple):

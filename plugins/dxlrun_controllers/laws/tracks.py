@@ -45,6 +45,11 @@ class Tracks:
         """True while a joint follows a trajectory; a stop does not count."""
         return bool(self._playing)
 
+    @property
+    def all_still(self) -> bool:
+        """True while all joints are at rest."""
+        return b"\0" not in self.still.tobytes()
+
     def free(self) -> Track:
         """Return a track that no joint follows, for the next trajectory."""
         return next(track for track in self._pool if track not in self._playing)
@@ -93,11 +98,12 @@ class Tracks:
             for track in self._playing:
                 track.trajectory.sample(clock_s + track.ahead_s, own)
                 np.copyto(desired.rows, own.rows, where=track.joints)
-            desired.acceleration *= rate**2
-            desired.acceleration += desired.velocity * slope
-            desired.velocity *= rate
+            if rate != 1.0 or slope:  # else the own time is that of the run
+                desired.acceleration *= rate**2
+                desired.acceleration += desired.velocity * slope
+                desired.velocity *= rate
             self._leave_ended(clock_s)
-        if self._stopping.any():
+        if 1 in self._stopping.tobytes():
             self.stop.sample(stop_s, own)
             np.copyto(desired.rows, own.rows, where=self._stopping)
             if stop_s >= self.stop.duration_s:

@@ -197,8 +197,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
             velocity=np.full(count, np.nan),
             settle_s=np.nan if tolerances.goal_time is None else tolerances.goal_time * 1e-9,
         )
-        self._within = self._own
-        """Tolerances of the active goal."""
+        self._set_tolerances(self._own)
         self._lower, self._upper = limits.lower, limits.upper
         self._wrap = np.array([joint in parameters.wrap for joint in joints])
         self._turns = np.isinf(limits.upper) & np.isinf(limits.lower) & ~self._wrap
@@ -284,7 +283,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         begin = self._path_of(moved)
         track.trajectory.load(whole_turns(data, begin.position, self._wrap & moved), begin, waited_s)
         self._warn_of_turns(track.trajectory, begin, np.flatnonzero(self._turns & moved))
-        self._within = self._own.replaced_by(more[1:], count)
+        self._set_tolerances(self._own.replaced_by(more[1:], count))
         self._set_track(track, moved)
         if self._refused_for_haste():
             self._brake(time_ns)
@@ -327,6 +326,10 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
             self._base_ns, self._base_s = time_ns, 0.0
             self._spliced, self._phase = None, _TrajectoryPhase.MOVING
 
+    def _set_tolerances(self, tolerances: GoalLimits) -> None:
+        """Set the tolerances of the active goal."""
+        self._within, self._checks_path = tolerances, tolerances.checks_path
+
     def _set_track(self, track: Track, moved: NDArray[np.bool_]) -> None:
         self._trajectory, self._moved, self._unmoved = track.trajectory, moved, ~moved
 
@@ -337,7 +340,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
     def on_hold(self, time_ns: int) -> None:
         """Stop all joints from their desired velocity, and hold them."""
         self._anchor_ns, self._moves = None, True
-        if not self._still.all():
+        if not self._tracks.all_still:
             self._stop_from(time_ns)
 
     @property
@@ -348,7 +351,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
     def _know_begin(self, time_ns: int) -> None:
         """Update the speed factor and the desired state from which a new trajectory starts now."""
         if not self._tracks.playing:
-            self._rate = 1.0 if not self._still.all() and self._speed <= _STILL else self._speed
+            self._rate = 1.0 if not self._tracks.all_still and self._speed <= _STILL else self._speed
             self._slope = 0.0 if self._rate == self._speed else -SPEED_SLOPE
             self._base_ns, self._base_s = time_ns, 0.0
         self._know_where(time_ns)
@@ -367,7 +370,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         """Update the desired state to this cycle; joints without one take their measured position."""
         if self._unknown:
             self._unknown = take_where_heard(self._desired.position, self.context.states)
-        if not self._still.all():
+        if not self._tracks.all_still:
             self._sample(time_ns)
 
     def _path_of(self, moved: NDArray[np.bool_]) -> SplineSample:
@@ -437,7 +440,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
             self._leave_stream()
         if self._spliced is not None:
             self._splice(self._spliced, time_ns)
-        elapsed = 0.0 if self._still.all() else self._sample(time_ns)
+        elapsed = 0.0 if self._tracks.all_still else self._sample(time_ns)
         if self._phase is _TrajectoryPhase.MOVING:
             self._move(time_ns, elapsed)
         elif self._phase is _TrajectoryPhase.STOPPING:
@@ -459,7 +462,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
             self._hand_over(time_ns)
         elif self._goal is None:
             return
-        elif self._within.checks_path and (row := self._find_off_path()) >= 0:
+        elif self._checks_path and (row := self._find_off_path()) >= 0:
             self._end_goal(Outcome.ABORTED, time_ns, f"{self._off_path_text(row)}, stopping", row)
             self._stop_from(time_ns)
         elif time_ns - self._start_ns > self._timeout_ns:
@@ -537,7 +540,7 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         self._phase, self._stop_ns = _TrajectoryPhase.STOPPING, time_ns
 
     def _come_to_rest(self, time_ns: int) -> None:
-        if self._still.all():
+        if self._tracks.all_still:
             self._phase = _TrajectoryPhase.RESTING
             self._end_goal(Outcome.CANCELLED, time_ns)  # other outcomes end the goal before the stop
 

@@ -50,9 +50,9 @@ from dxlrun_controllers.laws.spline import (
     CUBIC,
     DECELERATION,
     LINEAR,
+    Polynomial,
     SplineSample,
     StopTrajectory,
-    evaluate,
     peak_velocities,
     solve,
 )
@@ -345,12 +345,11 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         self._wrap = np.array([joint in parameters.wrap for joint in context.joints])
         self._now = SplineSample(count)
         """Present goals, rad, and velocities by the motion's own time, rad/s."""
-        self._piece = np.zeros((CUBIC, count))
+        self._piece, self._way = np.zeros((CUBIC, count)), Polynomial(count)
         self._ends = np.zeros((2, 2, count))
         """Position and velocity at the start and at the end of the present step."""
         self._stop = StopTrajectory(count)
         self._deceleration = finite_or(context.limits.acceleration, DECELERATION)
-        self._order = CUBIC
         self._limp = np.zeros(count, dtype=np.bool_)
         """True for each joint that has no torque now; only used with `partial`."""
         self._out = np.zeros(count, dtype=np.bool_)
@@ -499,7 +498,7 @@ class KeyframePlayer(Controller[KeyframeParameters]):
                 self._hand_over()
                 return
         if self._time_s < self._step_s:
-            evaluate(self._piece[: self._order], self._time_s, self._now)
+            self._way.evaluate(self._time_s, self._now)
         else:
             self._reach()
         self._write_commands()
@@ -547,8 +546,9 @@ class KeyframePlayer(Controller[KeyframeParameters]):
             if needed > self._step_s:
                 self._total_s += (needed - self._step_s) / self._motion.speed
                 self._step_s = needed
-        self._order = LINEAR if step.interpolation == "linear" and not softly else CUBIC
-        solve(self._order, self._step_s, start, end, self._piece[: self._order])
+        order = LINEAR if step.interpolation == "linear" and not softly else CUBIC
+        solve(order, self._step_s, start, end, self._piece[:order])
+        self._way.set_piece(self._piece[:order])
         np.copyto(self.context.commands.effort, torque, where=np.isfinite(torque))
         if step.registers:
             for joint, items in step.registers.items():

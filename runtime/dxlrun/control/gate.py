@@ -123,7 +123,7 @@ class Gate:
         self.counts: NDArray[np.int64] = self._joints["counts"]
         self._begun, self._before = np.zeros((2, count), dtype=np.uint8)
         self._now_ns = 0  # Sum of the times between cycles
-        self._clamps: dict[tuple[Clamp, int], _ReportedClamp] = {}
+        self._clamps: dict[tuple[int, int], _ReportedClamp] = {}
         """Clamps whose begin was reported and whose end was not, by clamp bit and row of the joint."""
         states, commands, goals = record.states, record.commands, record.goals
         self._gate = STRUCTS["Gate"](
@@ -249,19 +249,20 @@ class Gate:
     def _report_begun(self) -> None:
         for bit, what in _WHAT.items():
             for row in np.flatnonzero(self._begun & np.uint8(bit)).tolist():
-                if (bit, row) in self._clamps:
+                if (bit.value, row) in self._clamps:
                     continue
                 name = self._plan.joints[row].name
                 # A fallback may command the joint by now. The fault's own event names the controller.
                 owner = "" if bit is Clamp.NOT_FINITE else self._owner(name)
                 own = self._limited[row].find_servo_limit(_LIMITED[bit]) if bit in _LIMITED else None
                 what_by = f"clamped by register {own.text}" if own else what
-                self._clamps[bit, row] = _ReportedClamp(what_by, self._now_ns, self._now_ns)
+                self._clamps[bit.value, row] = _ReportedClamp(what_by, self._now_ns, self._now_ns)
                 self._events.emit_event(name, texts.goal_clamped(name, owner, what_by))
 
     def _report_ended(self) -> None:
+        bits = self._record.clamped
         for (bit, row), clamped in tuple(self._clamps.items()):
-            if self._record.clamped[row] & bit:
+            if bits.item(row) & bit:
                 clamped.last_ns = self._now_ns
             elif self._now_ns - clamped.last_ns >= CLAMP_ENDS_NS:
                 del self._clamps[bit, row]

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import fields
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple, NoReturn, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -208,7 +208,7 @@ class Outputs:
         places = _places(plan.source_commands, layout.source_commands)
         self._send(sources, plan.source_commands, record.source_commands, places)
         self._claimed = np.array([name != "" for name in self._names], dtype=np.bool_)
-        self._finite, self._seen, self._wrong = np.zeros((3, own.size), dtype=np.bool_)
+        self._finite, self._seen = np.zeros((2, own.size), dtype=np.bool_)
 
     def _send(
         self, begin: int, names: Sequence[str], merged: Floats, rows: NDArray[np.intp], interface: str = ""
@@ -241,20 +241,25 @@ class Outputs:
         Raises:
             ControllerFault: A command is infinite, or is NaN after a finite value.
         """
-        own, seen, wrong = self.own, self._seen, self._wrong
-        # `greater` of bools is "claimed and not finite", without a temporary array.
-        np.greater(self._claimed, np.isfinite(own, self._finite), wrong)
-        if np.count_nonzero(wrong) and (wrong := wrong & (seen | np.isinf(own))).any():
-            if self._rows is not None:
-                joints = wrong[: self.commands.values.size].reshape(self.commands.values.shape).any(axis=0)
-                self._clamped[self._rows[joints]] |= np.uint8(Clamp.NOT_FINITE)
-            first = int(np.flatnonzero(wrong)[0])
-            after = " after a finite value" if seen[first] else ""
-            raise ControllerFault(
-                f"controller {self._owner} commanded {self._names[first]} = {own[first]}{after}"
-            )
-        np.logical_or(seen, self._finite, seen)
+        own, seen, finite = self.own, self._seen, self._finite
+        np.isfinite(own, finite)
+        # Bytes are compared in a tenth of the time of a numpy reduction.
+        if finite.tobytes() != self._claimed.tobytes():
+            wrong = self._claimed & ~finite & (seen | np.isinf(own))
+            if wrong.any():
+                self._report_wrong(wrong)
+        np.logical_or(seen, finite, seen)
         self.taken = own.tobytes()
+
+    def _report_wrong(self, wrong: NDArray[np.bool_]) -> NoReturn:
+        if self._rows is not None:
+            joints = wrong[: self.commands.values.size].reshape(self.commands.values.shape).any(axis=0)
+            self._clamped[self._rows[joints]] |= np.uint8(Clamp.NOT_FINITE)
+        first = int(np.flatnonzero(wrong)[0])
+        after = " after a finite value" if self._seen[first] else ""
+        raise ControllerFault(
+            f"controller {self._owner} commanded {self._names[first]} = {self.own[first]}{after}"
+        )
 
     def merge_commands(self) -> None:
         """Copy the controller's commands into the robot's arrays."""
