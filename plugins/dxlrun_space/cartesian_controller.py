@@ -63,8 +63,8 @@ SPEED: Final = 4.0
 """Speed of joints without a limit, rad/s: less than the slowest arm servo's at 12 V."""
 FULL: Final = 6
 """Number of joints that can follow every orientation."""
-STEP_NS: Final = 750_000
-"""Period that pays for one step of planning: a step takes 0.06 ms, so planning takes 8 % of a cycle."""
+STEP_NS: Final = 500_000
+"""Period that pays for one step of planning: a step takes 0.06 ms, so planning takes 12 % of a cycle."""
 MOST_STEPS: Final = 50
 """Most steps of a cycle, 3 ms."""
 FEEDBACK_NS: Final = 100_000_000

@@ -151,7 +151,7 @@ def plan_joints(
     """Plan a motion in which all joints turn evenly from the start to the pose."""
     found = yield from solver.search(target, start, exact=exact)
     if not _suffices(found.residual, exact):
-        return NoPath(_out_of_reach(found.residual))
+        return NoPath(_out_of_reach(found.residual, exact))
     ways = [b - a for a, b in zip(start, found.positions, strict=True)]
     count = _count(max(map(abs, ways)) / _NODE_RAD)
     places = [index / count for index in range(count + 1)]
@@ -163,6 +163,10 @@ def plan_line(
     solver: Solver, start: Positions, target: Pose, limits: MotionLimits, *, exact: bool
 ) -> Planning:
     """Plan a motion in which the tip moves on a straight line and turns about one axis to the pose."""
+    search = solver.search(target, start, exact=True) if exact else solver.search_place(target, start)
+    found = yield from search
+    if not _suffices(found.residual, exact):
+        return NoPath(_out_of_reach(found.residual, exact))
     begin = solver.chain.pose(start)
     way, turn = distance(begin, target)
     length = math.hypot(*way)
@@ -186,9 +190,6 @@ def plan_line(
         elif step > finest and len(nodes) < _MOST_SPLIT:
             step /= 2
         else:
-            found = yield from solver.search(target, nodes[-1], exact=exact)
-            if not _suffices(found.residual, exact):
-                return NoPath(_out_of_reach(found.residual))
             passed, whole = places[-1] * length * 1e3, length * 1e3
             return NoPath(
                 f"the straight line ends after {passed:.0f} of {whole:.0f} mm, at a limit of a joint or "
@@ -198,8 +199,8 @@ def plan_line(
     return (yield from _timed(solver, places, nodes, target, limits))
 
 
-def _out_of_reach(residual: Residual) -> str:
-    turn = f" and {math.degrees(residual.orientation):.1f} deg" if residual.orientation > 1e-3 else ""
+def _out_of_reach(residual: Residual, exact: bool) -> str:
+    turn = f" and {math.degrees(residual.orientation):.1f} deg" if exact else ""
     return f"the pose is out of reach; the nearest is {residual.position * 1e3:.1f} mm{turn} away"
 
 

@@ -12,6 +12,7 @@ from collections.abc import Generator, Sequence
 from typing import Final
 
 import msgspec
+import numpy as np
 
 from dxlrun_space.chain import Chain, Column, Pose, Vector, inverted, rotation_vector, times
 
@@ -25,13 +26,19 @@ CLOSE_RAD: Final = 2e-4
 """Orientation error of a solution, rad."""
 STEPS: Final = 20
 """Steps per start of a search."""
-FIRST_STARTS: Final = 8
-"""Starts of a search before it asks whether the position is in reach: the present positions, the middle of
-the limits, then positions spread over the limits."""
-STARTS: Final = 100
-"""Most starts. One in six leads to a solution of the worst arm that was tried, a Koch."""
-_NEAR_M: Final = 1e-3
-"""Position error of the first starts, m, beyond which a pose counts as out of reach."""
+SAMPLES: Final = 1000
+"""Positions whose poses are known beforehand. A search begins at those with the nearest poses."""
+STARTS: Final = 128
+"""Most starts for position and orientation; a Koch, the worst arm, needed 79 for one of 4000 poses."""
+FIRST_PLACES: Final = 4
+PLACES: Final = 8
+"""Starts for the position alone. Where the arm is folded, limits keep some of them from a place in reach."""
+_FAR: Final = 0.05
+"""Position error, as a fraction of the length, beyond which a pose counts as out of reach after the first."""
+_FAILING: Final = 0.8
+"""A start is given up when two steps together do not reduce the cost to this fraction."""
+_STALLING: Final = 1 - 1e-5
+"""Ratio of two costs beyond which the nearest position is found: the rest is 0.01 mm in 1 m."""
 _POSTURE: Final = 1e-5
 """Weight of the distance from the posture, as a fraction of the arm's length, m/rad."""
 _PULL: Final = 0.02
@@ -111,42 +118,66 @@ class Solver:
         self._posture = tuple(posture) or (None,) * len(chain.joints)
         self._redundant = len(chain.joints) > _POSE and any(each is not None for each in self._posture)
         self._tendency = (_POSTURE * chain.length) ** 2
+        self._samples = [self._spread(number) for number in range(SAMPLES)]
+        poses = [(*place, *rotation) for rotation, place in map(chain.pose, self._samples)]
+        self._table = np.array(poses).T.copy()
+        """Position and rotation matrix of each sample, one column each."""
+
+    def _spread(self, number: int) -> tuple[float, ...]:
+        """Return positions that are spread evenly over the limits: a Halton sequence."""
+        positions = []
+        for index, (lower, upper) in enumerate(zip(self.lower, self.upper, strict=True)):
+            low, high = max(lower, -math.pi), min(upper, math.pi)
+            positions.append(low + _halton(number + 1, _PRIMES[index % len(_PRIMES)]) * (high - low))
+        return tuple(positions)
+
+    def _nearest(self, target: Pose, weight: float) -> list[tuple[float, ...]]:
+        """Return the samples, the one with the nearest pose first.
+
+        Sums and products of single elements only, which are the same on each processor.
+        """
+        half = (weight * self.chain.length) ** 2 / 2
+        far = np.zeros(SAMPLES)
+        for index, value in enumerate((*target[1], *target[0])):
+            far += (self._table[index] - value) ** 2 * (half if index > 2 else 1.0)
+        return [self._samples[index] for index in far.argsort(kind="stable")[:STARTS].tolist()]
 
     def search(self, target: Pose, start: Sequence[float], *, exact: bool) -> Search:
         """Search from several starts; the first is `start`. The best solution is returned.
 
         The result is close to the target, or the nearest that was found: by position first unless `exact`.
         """
-        best = yield from self.search_from(target, start, exact=True)
-        for number in range(1, FIRST_STARTS):
+        best = yield from self._descend(target, start, EXACT, is_patient=False)
+        if not best.residual.is_close:
+            place = yield from self.search_place(target, best.positions)
+            if place.residual.position > _FAR * self.chain.length:
+                return (yield from self.search_from(target, place.positions, exact=False))
+            best = yield from self._search_samples(target, best, exact)
+            if not exact and not best.residual.is_close:
+                place = min(place, best, key=lambda one: one.residual.position)
+                best = yield from self.search_from(target, place.positions, exact=False, steps=2 * STEPS)
+        if self._redundant:
+            best = yield from self.search_from(target, best.positions, exact=True)
+        return best
+
+    def search_place(self, target: Pose, start: Sequence[float]) -> Search:
+        """Search for the nearest position, with any orientation."""
+        best = yield from self._descend(target, start, 0.0)
+        for number, each in enumerate(self._nearest(target, 0.0)[:PLACES]):
+            far = best.residual.position
+            if far <= CLOSE_M or (number >= FIRST_PLACES and far > _FAR * self.chain.length):
+                break
+            found = yield from self._descend(target, each, 0.0, 2 * STEPS)
+            best = min(best, found, key=lambda one: one.residual.position)
+        return best
+
+    def _search_samples(self, target: Pose, best: Solution, exact: bool) -> Search:
+        for each in self._nearest(target, EXACT):
+            found = yield from self._descend(target, each, EXACT, is_patient=False)
+            best = min(best, found, key=lambda one: _cost(one.residual, exact))
             if best.residual.is_close:
                 return best
-            found = yield from self.search_from(target, self._start(number, start), exact=True)
-            best = min(best, found, key=lambda one: _cost(one.residual, exact))
-        # Position and orientation are not reached together: is the position in reach at all?
-        nearest = best
-        for each in (best.positions, *(self._start(number, start) for number in range(FIRST_STARTS))):
-            found = yield from self.search_from(target, each, exact=False, steps=2 * STEPS)
-            nearest = min(nearest, found, key=lambda one: _cost(one.residual, exact=False))
-        if nearest.residual.position > _NEAR_M:
-            return best if exact else nearest
-        for number in range(FIRST_STARTS, STARTS):
-            found = yield from self.search_from(target, self._start(number, start), exact=True)
-            if found.residual.is_close:
-                return found
-            best = min(best, found, key=lambda one: _cost(one.residual, exact))
-        return best if exact else nearest
-
-    def _start(self, number: int, start: Sequence[float]) -> tuple[float, ...]:
-        """Return the positions at which a search begins: a Halton sequence after the first two."""
-        if number == 0:
-            return tuple(start)
-        positions = []
-        for index, (lower, upper) in enumerate(zip(self.lower, self.upper, strict=True)):
-            low, high = max(lower, -math.pi), min(upper, math.pi)
-            share = 0.5 if number == 1 else _halton(number + 3, _PRIMES[index % len(_PRIMES)])
-            positions.append(low + share * (high - low))
-        return tuple(positions)
+        return (yield from self._descend(target, best.positions, EXACT, 5 * STEPS))
 
     def search_from(
         self,
@@ -179,7 +210,14 @@ class Solver:
         return found
 
     def _descend(
-        self, target: Pose, start: Sequence[float], weight: float, steps: int, leash: float
+        self,
+        target: Pose,
+        start: Sequence[float],
+        weight: float,
+        steps: int = STEPS,
+        leash: float = math.inf,
+        *,
+        is_patient: bool = True,
     ) -> Search:
         scale = self.chain.length
         weight = (weight * scale) ** 2
@@ -190,8 +228,11 @@ class Solver:
             for a, b in zip(now, self._posture, strict=True)
         ]
         model = self._model(target, now, posture, weight)
+        before = last = math.inf
         for _ in range(steps):
             if model.residual.is_exact and self._tendency < model.weight * 1e-3:
+                break
+            if weight == 0.0 and model.residual.position <= CLOSE_M / 20:
                 break
             change = self._step(model, now, damping)
             trial = self._inside([a + b for a, b in zip(now, change, strict=True)])
@@ -200,11 +241,17 @@ class Solver:
             yield
             tried = self._model(target, trial, posture, weight)
             if tried.cost < model.cost:
+                is_still = weight == 0.0 and tried.cost > _STALLING * model.cost
                 now, model, damping = trial, tried, max(least, damping * 0.1)
+                if is_still:
+                    break
             elif damping >= most:
                 break
             else:
                 damping = max(damping, 1e-9 * scale * scale) * 5
+            if not is_patient and model.cost > _FAILING * before and not model.residual.is_close:
+                break
+            before, last = last, model.cost
         return Solution(now, model.residual)
 
     def _inside(self, positions: Sequence[float]) -> tuple[float, ...]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -77,6 +78,26 @@ class Arm:
                 moved[:3, :3] = turn(axis / np.linalg.norm(axis), at[joint.get("name")])
             pose, link = local @ moved @ pose, joint.find("parent").get("link")
         return pose
+
+    @cached_property
+    def _model(self) -> Any:
+        pin = import_module("pinocchio")
+        model = pin.buildModelFromXML(self.urdf)
+        return (
+            pin,
+            model,
+            model.createData(),
+            [model.joints[model.getJointId(name)].idx_q for name in self.joints],
+        )
+
+    def matrix_of_pinocchio(self, positions: Any) -> Any:
+        """Return the pose of the tip in the base as the second judge sees it."""
+        pin, model, data, places = self._model
+        whole = pin.neutral(model)
+        whole[places] = positions
+        pin.framesForwardKinematics(model, data, whole)
+        base, tip = (data.oMf[model.getFrameId(link)] for link in (self.base, self.tip))
+        return (base.inverse() * tip).homogeneous
 
     def target(self, positions: Any) -> Any:
         """Return the pose as the solver takes it."""
