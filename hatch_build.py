@@ -1,4 +1,4 @@
-"""Build backend and hook: hatchling, and what is in C compiled into the wheel: exchange and gate.
+"""Build backend and hook: hatchling, and what is in C compiled into the wheel.
 
 Where no C compiler works, `pip install .` fetches `ziglang` for the build alone, which has one. The object
 carries a checksum of its source, so that an old one is never used. `release/build.py` compiles for other
@@ -38,6 +38,7 @@ SOURCES = tuple(
         ("dxlwire", "exchange", "kernel.c"),
         ("dxlrun", "control", "gate.c"),
         ("dxlrun", "channels", "shared_memory.c"),
+        ("dxlsim", "motion", "mechanics.c"),
     )
 )
 """Each is compiled into an object of its own, which lies beside it: libkernel.so."""

@@ -38,6 +38,7 @@ OBJECTS = {
         "dxl_source",
     },
     "dxlrun/control/libgate.so": {"gate_apply", "dxl_source"},
+    "dxlsim/motion/libmechanics.so": {"motion_step_to", "dxl_source"},
     "dxlwire/exchange/libkernel.so": {
         "dxl_read",
         "dxl_write",

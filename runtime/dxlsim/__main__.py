@@ -22,7 +22,7 @@ from dxlsim.serving.simulation_server import Server, wake_on_signals
 from dxlsim.simulation_plan import BusConfig, SimulationConfig
 from dxlsim.texts.duration import parse_duration
 from dxlsim.texts.servo_words import bus_of_servos
-from dxlwire.exceptions import InputError
+from dxlwire.exceptions import InputError, NotCompiled
 
 _EXAMPLES = """\
 examples:
@@ -118,7 +118,7 @@ def main(words: Sequence[str] | None = None) -> int:
             Ledger(_open_ledger(given.ledger), keep=False) as ledger,
         ):
             _serve(config, ledger, stop=wake.fileno())
-    except (InputError, OSError) as error:
+    except (InputError, NotCompiled, OSError) as error:
         print(error, file=sys.stderr)
         return 2
     if ledger.error is not None:

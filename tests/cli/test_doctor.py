@@ -197,7 +197,7 @@ def test_doctor_looks_at_this_machine(dxlrun: Dxlrun) -> None:
     assert all(check["fix"] for check in checks if check["state"] != "good")
 
 
-@pytest.mark.parametrize("what", ["kernel", "gate", "shared_memory"])
+@pytest.mark.parametrize("what", ["kernel", "gate", "mechanics", "shared_memory"])
 def test_each_compiled_part_is_looked_for(what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     sources = [tmp_path / path.name if path.stem == what else path for path in c_sources.SOURCES]
     monkeypatch.setattr(c_sources, "SOURCES", sources)

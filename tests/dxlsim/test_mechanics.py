@@ -136,6 +136,19 @@ def test_within_the_margin_nothing_drives_and_beyond_it_the_punch_does():
     assert 0.9 <= after(1, soft, Load(friction=0.09), angle=0.89)[0] < 0.95  # the punch gives 0.1 Nm
 
 
+def test_a_gain_given_later_acts_as_if_no_other_servo_had_one():
+    def angle(alone: bool) -> float:
+        mechanics = one(pid(5.0, 1.0), PENDULUM)
+        if not alone:
+            mechanics.command_servo(mechanics.add_servo(MOTOR, NO_LOAD, 0.0), pid(5.0, 1.0, i=9.0))
+        mechanics.step_to(S)
+        mechanics.command_servo(0, pid(5.0, 1.0, i=20.0))
+        mechanics.step_to(S + 50_000_000)
+        return state(mechanics)[0]
+
+    assert angle(alone=False) == pytest.approx(angle(alone=True), abs=1e-4)
+
+
 # Time
 
 
@@ -171,7 +184,7 @@ def test_a_servo_keeps_its_state_when_another_servo_is_added():
             mechanics.plant.jam(0, True)
         mechanics.step_to(4 * S)
         assert not joins or mechanics.plant.angle[1] == -1.0
-        return [moved, state(mechanics), float(mechanics.strain.temperature[0]), noted]
+        return [moved, state(mechanics), float(mechanics.servos["temperature"][0]), noted]
 
     alone = told(False)
     assert told(True) == alone
@@ -205,11 +218,11 @@ def test_copper_warms_by_the_square_of_the_torque_and_cools_again():
     mechanics = one(FULL._replace(bias=0.5), Load(friction=2.0))
     mechanics.step_to(60 * S)
     warm = AMBIENT_C + STALLED_RISE_C * 0.25 * (1 - math.exp(-60 / COOLING_S))
-    assert mechanics.strain.temperature[0] == pytest.approx(warm, rel=0.01)
+    assert mechanics.servos["temperature"][0] == pytest.approx(warm, rel=0.01)
     mechanics.command_servo(0, LIMP)
     mechanics.step_to(660 * S)
     cool = AMBIENT_C + (warm - AMBIENT_C) * math.exp(-600 / COOLING_S)
-    assert mechanics.strain.temperature[0] == pytest.approx(cool, rel=0.01)
+    assert mechanics.servos["temperature"][0] == pytest.approx(cool, rel=0.01)
 
 
 def test_a_load_that_cannot_be_held_is_reported_after_a_second_and_a_hard_start_is_not():

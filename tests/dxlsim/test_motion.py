@@ -159,7 +159,7 @@ def test_every_model_settles_where_it_should_without_much_overshoot():
     for now in range(0, 3 * S, 10_000_000):
         mechanics.step_to(now)
         highest = [max(pair) for pair in zip(highest, mechanics.plant.angle.tolist(), strict=True)]
-    torques = mechanics.law.torque.tolist()
+    torques = mechanics.servos["torque"].tolist()
     for servo, goal, top, torque in zip(servos, goals, highest, torques, strict=True):
         servo.advance_to(3 * S)
         table, margin = servo.registers.table, servo.registers.get("cw_compliance_margin")

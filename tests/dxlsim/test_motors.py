@@ -205,7 +205,7 @@ def test_time_constant_and_gain_are_those_that_were_identified(model):
     goal = round((START + 0.02) / table.rad_per_tick)
     servo.poke("goal_position", goal)
     mechanics.step_to(STEP_NS)
-    duty = float(mechanics.law.duty[0]) / (goal * table.rad_per_tick - START)
+    duty = float(mechanics.servos["duty"][0]) / (goal * table.rad_per_tick - START)
     assert duty == pytest.approx(bench.stiffness, rel=0.02)
     assert servo.registers[bench.gain] == table.items[bench.gain].initial
 

@@ -78,7 +78,7 @@ def test_goals_act_in_the_order_and_at_the_distance_in_which_they_came():
         command(servo, goal_position=goal)
         bus.advance_to(bus.now_ns + 30 * MS)
     # 60 ms after the first goal only this one acts
-    assert servo.shaft.mechanics.profiles.position[0] == pytest.approx(1400 * unit)
+    assert servo.shaft.mechanics.servos["setpoint"][0] == pytest.approx(1400 * unit)
     bus.advance_to(bus.now_ns + 500 * MS)
     assert servo.shaft_angle == pytest.approx(1500 * unit, abs=0.01)
 

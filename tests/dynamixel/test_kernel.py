@@ -357,6 +357,7 @@ def test_a_wheel_has_every_object_that_is_compiled(build, tmp_path):
         "dxlwire/exchange/libkernel.so",
         "dxlrun/control/libgate.so",
         "dxlrun/channels/libshared_memory.so",
+        "dxlsim/motion/libmechanics.so",
     )
     assert tuple(data["force_include"].values()) == rooms
     assert all(Path(made).stat().st_size for made in data["force_include"])

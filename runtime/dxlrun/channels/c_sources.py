@@ -10,7 +10,12 @@ from dxlwire.exceptions import NotCompiled
 
 SOURCES = tuple(
     Path(__file__).parents[2] / name
-    for name in ("dxlrun/channels/shared_memory.c", "dxlrun/control/gate.c", "dxlwire/exchange/kernel.c")
+    for name in (
+        "dxlrun/channels/shared_memory.c",
+        "dxlrun/control/gate.c",
+        "dxlsim/motion/mechanics.c",
+        "dxlwire/exchange/kernel.c",
+    )
 )
 """Paths of the C files that must be compiled when dxlrun is installed."""
 

@@ -23,7 +23,6 @@ def fix_to_links(devices: Iterable[SimulatedDevice], mechanics: Mechanics, sense
         KeyError: The URDF does not have the link.
     """
     body, count = SimulatedBody(sensed), sensed.servos
-    mechanics.sense()
     for device in devices:
         if device.link:
             body.motion(device.link)

@@ -165,7 +165,6 @@ class ShaftPublisher:
         self._mechanics, self._sink = mechanics, sink
         self._values = np.zeros(sink.values).reshape(3, -1)
         self._shown_ns = -1
-        mechanics.sense()
 
     def write_shafts(self) -> None:
         """Write the shafts' motion to the sink if the mechanics have advanced since the last call."""
@@ -187,7 +186,6 @@ class SensedBody:
         """Read the URDF of `bodies`. Raises InputError for an invalid one."""
         self._body, self._mechanics, self._now_ns = SimulatedBody(bodies), mechanics, now_ns
         self._count = bodies.servos
-        mechanics.sense()
 
     def motion(self, link: str) -> LinkMotion:
         """Return the motion of a link at the present time of the simulation.

@@ -15,6 +15,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from dxlsim.motion.compiled_mechanics import library
 from dxlsim.motion.plant import (
     JAMMED_NM,
     Floats,
@@ -22,8 +23,8 @@ from dxlsim.motion.plant import (
     Part,
     Plant,
     PlantJoint,
-    Stribecks,
     combine_plants,
+    stribecks,
 )
 from dxlsim.simulation_plan import Mechanism
 
@@ -67,7 +68,7 @@ class CoupledJoints:
         self._own_friction = np.array([motor.friction for motor in motors]) / size
         self._jammed = np.zeros(len(joints))
         self._load_friction = np.array([motor.load_friction for motor in motors])
-        self._stribeck = Stribecks(joints) if any(motor.stribeck for motor in motors) else None
+        self._stribeck = stribecks(joints) if any(motor.stribeck for motor in motors) else None
         self._joint_friction = [load.friction for load in loads]
         # Directions of friction: each servo's own, and each joint's.
         self._rows: Floats = np.vstack([np.eye(len(joints)), self._matrix])
@@ -85,7 +86,10 @@ class CoupledJoints:
             self._take_braking(braking, dt_s)
         most: Floats = self._own_friction + self._load_friction * np.abs(torque - braking * speed + pull)
         if self._stribeck is not None:
-            most = most + self._stribeck.friction(self.velocity) / self._size
+            rubs = np.empty(len(most))
+            arrays = (each.ctypes.data for each in (self._stribeck, self.velocity, rubs))
+            library().motion_stribeck(*arrays, len(most))
+            most = most + rubs / self._size
         most = most + self._jammed
         free = self._inverse @ (self._mass @ speed + dt_s * (torque - pull))
         speed = self._rubbed(free, [*most.tolist(), *self._joint_friction], dt_s)

@@ -1,11 +1,11 @@
 """Mechanics: motion of all servos of one simulation, stepped together on one time grid.
 
-In each step the profiles give the setpoints of the servos' controllers, the control law gives the torque
-of the motors, and the plant gives the motion. Commands take effect at the next point of the grid; between
-grid points angles are extrapolated with their velocity. Nothing is computed while all servos rest."""
+`mechanics.c` has the steps. Commands take effect at the next point of the grid; between grid points angles
+are extrapolated with their velocity. Nothing is computed while all servos rest."""
 
 from __future__ import annotations
 
+import ctypes
 import heapq
 import itertools
 import math
@@ -16,7 +16,8 @@ from importlib.metadata import entry_points
 import msgspec
 import numpy as np
 
-from dxlsim.motion.control_law import LIMP, ROWS, ControlLaw, Profiles, ServoCommand
+from dxlsim.motion.compiled_mechanics import SERVO, STRUCTS, StepResult, library
+from dxlsim.motion.control_law import LIMP, ServoCommand
 from dxlsim.motion.coupled_joints import joints_without_bodies
 from dxlsim.motion.link_motion import Shafts
 from dxlsim.motion.motor import Motor
@@ -32,11 +33,6 @@ Catching up after a long pause of the host would delay the next reply."""
 
 STRAIN_NS = 100_000_000  # Interval at which heat and load are updated; a whole number of steps
 
-_STEPS_A_LOOK = 16  # Steps between two checks for rest
-
-_STILL, _UNDRIVEN = 1e-6, 1e-8  # rad/s, and its change in a step: a servo rests below both
-
-
 AMBIENT_C = 30.0  # Temperature of a servo at rest, degrees C [i]
 
 STALLED_RISE_C = 300.0
@@ -48,9 +44,10 @@ COOLING_S = 400.0  # Time constant of housing and winding, modelled as one body 
 OVERLOAD_PART = 0.8
 """Fraction of the torque allowed by the limit, above which the servo counts as overloaded [i]."""
 
-OVERLOAD_TICKS = 10  # Tolerated duration in ticks of `Strain`: a second [i]
+OVERLOAD_TICKS = 10  # Tolerated duration in intervals of STRAIN_NS: a second [i]
 
-_STEADY_C = 1e-7  # degrees C in a tick; a smaller change has no visible effect in years
+_NEVER = 2**63 - 1
+_COMMAND = [*ServoCommand._fields]
 
 SUPPLY_OHM = 0.1  # Resistance of cable and connectors between supply and servo [i]
 
@@ -68,9 +65,6 @@ class Mechanics:
 
     def __init__(self, start_ns: int, plant: PlantMaker | None = None) -> None:
         self._make_plant: PlantMaker = plant or IndependentJoints
-        self.grid_ns = start_ns  # Time of the last step
-        self._start_ns = start_ns
-        self._next_strain_ns = start_ns + STRAIN_NS
         self._motors: list[Motor] = []
         self._loads: list[Load] = []
         self._recounted: list[float] = []
@@ -78,33 +72,56 @@ class Mechanics:
         self._agenda: list[tuple[int, int, Callable[[], None]]] = []
         self._order = itertools.count()
         self._hands: dict[int, _Hand] = {}
-        self._busy = False
-        self._commanded = False
-        self.still = False  # True while all servos rest without new commands
-        self._before: Floats | None = None
-        """Velocities of the shafts before the last step, rad/s; None unless `sense` was called."""
+        self._state = STRUCTS["Mechanics"](
+            step_ns=STEP_NS,
+            strain_step_ns=STRAIN_NS,
+            start_ns=start_ns,
+            grid_ns=start_ns,
+            strain_ns=start_ns + STRAIN_NS,
+            agenda_ns=_NEVER,
+            step_s=STEP_NS * 1e-9,
+            strain_part=STRAIN_NS * 1e-9 / COOLING_S,
+            ambient_c=AMBIENT_C,
+            stalled_rise_c=STALLED_RISE_C,
+            overload_part=OVERLOAD_PART,
+            overload_ticks=OVERLOAD_TICKS,
+        )
+        self._library = library()
+        self._address = ctypes.addressof(self._state)
+        self.servos = np.zeros(0, dtype=SERVO)
+        """Struct `Servo` of mechanics.c for each servo: command, setpoint, torque (Nm), duty, temperature
+        (degrees C)."""
         self._build(np.zeros(0), np.zeros(0))
+
+    @property
+    def grid_ns(self) -> int:
+        """Time of the last step, ns."""
+        grid_ns: int = self._state.grid_ns
+        return grid_ns
+
+    @property
+    def still(self) -> bool:
+        """True while all servos rest without new commands."""
+        return bool(self._state.still)
 
     # Servos
 
     def add_servo(self, motor: Motor, load: Load, angle: float) -> int:
         """Add a servo at rest and limp, with its shaft at `angle`, rad from its raw 0; return the index by
         which other methods address it."""
-        plant, profiles, law, strain = self.plant, self.profiles, self.law, self.strain
-        commands, count = self._commands, len(self._motors)
         self._motors.append(motor)
         self._loads.append(load)
         self._recounted.append(0.0)
-        # The arrays of a plant have a fixed size, so all parts are rebuilt, and their state is copied.
+        added = np.zeros(1, dtype=SERVO)
+        added[_COMMAND][0] = LIMP._replace(goal=angle)
+        added["setpoint"], added["motor_damping"] = angle, motor.damping
+        added["stall"] = added["nominal_stall"] = motor.stall_torque
+        added["temperature"] = AMBIENT_C
+        # The arrays of a plant have a fixed size, so it is rebuilt, and its state is copied.
+        plant, self.servos = self.plant, np.append(self.servos, added)
         self._build(np.append(plant.angle, angle), np.append(plant.velocity, 0.0))
-        self._commands[:, :count] = commands
-        self._commands[ROWS["goal"], count] = angle
-        self.profiles.position[:count], self.profiles.velocity[:count] = profiles.position, profiles.velocity
-        self.law.stall[:count], self.law.integral[:count] = law.stall, law.integral
-        self.strain.temperature[:count] = strain.temperature
-        self.strain.overloaded[:count] = strain.overloaded
         self._wake()
-        return count
+        return len(self._motors) - 1
 
     def jam_shaft(self, index: int, on: bool) -> None:
         """Block a servo's shaft at its present angle, or release it."""
@@ -123,38 +140,42 @@ class Mechanics:
     def supply(self, index: int, volts: float) -> None:
         """Set a servo's supply voltage, V; its stall torque and no-load speed change in proportion."""
         motor = self._motors[index]
-        self.law.stall[index] = motor.stall_torque * (volts / motor.voltage if motor.voltage else 1.0)
+        self.servos["stall"][index] = motor.stall_torque * (volts / motor.voltage if motor.voltage else 1.0)
         self._wake()
 
     def command_servo(self, index: int, command: ServoCommand) -> None:
         """Give a servo's controller new parameters. Its trajectory continues from its setpoint, or from
         the shaft if it was limp."""
-        was_limp = self._commands[ROWS["limit"], index] == 0.0
-        was_turning = self._commands[ROWS["turning"], index] != 0.0
-        self._commands[:, index] = command
+        servo = self.servos[index]
+        was_limp, was_turning = servo["limit"] == 0.0, servo["turning"] != 0.0
+        self._commands[index] = command
         if command.limit == 0.0:
-            self._commands[ROWS["goal"], index] = self.plant.angle[index]
+            servo["goal"] = self.plant.angle[index]
         if was_limp or command.limit == 0.0 or was_turning != (command.turning != 0.0):
-            self.profiles.position[index] = self.plant.angle[index]
-            self.profiles.velocity[index] = self.plant.velocity[index] if command.turning else 0.0
-            self.law.integral[index] = 0.0
+            servo["setpoint"] = self.plant.angle[index]
+            servo["setpoint_velocity"] = self.plant.velocity[index] if command.turning else 0.0
+            servo["integral"] = 0.0
         self._wake()
 
     def aim(self, index: int, goal: float, speed: float, acceleration: float) -> None:
         """Change only a servo's goal, rad, and the speed, rad/s, and acceleration, rad/s^2, of its
         trajectory."""
-        self.profiles.aim(index, goal, speed, acceleration)
-        self.strain.calm = False
-        self.still = False
+        servo = self.servos[index]
+        servo["goal"], servo["speed"], servo["acceleration"] = goal, speed, acceleration
+        self._wake()
+
+    def at_goal(self, index: int) -> bool:
+        """Return True if a servo's trajectory has ended; with a speed command, if that speed is reached."""
+        return bool(self._library.motion_at_goal(self._state.servos + index * SERVO.itemsize))
 
     def move_shaft(self, index: int, angle: float) -> None:
         """Move a resting shaft to an angle, rad, at once; its trajectory begins there."""
         self.plant.place_shaft(index, angle)
-        self.profiles.position[index], self.profiles.velocity[index] = angle, 0.0
-        if self._commands[ROWS["limit"], index] == 0.0:
-            self._commands[ROWS["goal"], index] = angle
-        self.profiles.arrived = False
-        self.still = False
+        servo = self.servos[index]
+        servo["setpoint"], servo["setpoint_velocity"] = angle, 0.0
+        if servo["limit"] == 0.0:
+            servo["goal"] = angle
+        self._state.arrived = self._state.still = False
 
     def recount_turns(self, index: int, angle: float) -> None:
         """Stop a shaft, and change its count of turns so that its angle becomes `angle`, rad; its
@@ -178,27 +199,24 @@ class Mechanics:
         """
         steps = max(1, round(duration_ns / STEP_NS))
         self._hands[index] = _Hand(by / (steps * STEP_NS * 1e-9), steps, gives_way)
-        self.still = False
+        self._state.hands = len(self._hands)
+        self._state.still = False
 
     def heat(self, index: int, celsius: float) -> None:
         """Set a servo's temperature, degrees C; it then approaches the temperature that its load causes."""
-        self.strain.temperature[index] = celsius
-        self.strain.calm = False
+        self.servos["temperature"][index] = celsius
+        self._state.calm = False
 
     def overloaded(self, index: int) -> bool:
         """Return True if a servo has been overloaded for OVERLOAD_TICKS or longer."""
-        return bool(self.strain.overloaded[index] >= OVERLOAD_TICKS)
+        return bool(self.servos["overloaded"][index] >= OVERLOAD_TICKS)
 
     # For sensors on the bodies
 
-    def sense(self) -> None:
-        """Record velocities from the next step on, so that `acceleration` is available."""
-        self._before = self.plant.velocity.copy()
-
     @property
     def acceleration(self) -> Floats:
-        """Accelerations of the shafts in the last step, rad/s^2; zeros unless `sense` was called before."""
-        if self.still or self._before is None or len(self._before) != len(self._motors):
+        """Accelerations of the shafts in the last step, rad/s^2."""
+        if self.still:
             return np.zeros(len(self._motors))
         return (self.plant.velocity - self._before) / (STEP_NS * 1e-9)
 
@@ -215,6 +233,7 @@ class Mechanics:
     def call_at(self, t_ns: int, action: Callable[[], None]) -> None:
         """Call `action` at the first grid point at or after `t_ns`."""
         heapq.heappush(self._agenda, (t_ns, next(self._order), action))
+        self._state.agenda_ns = self._agenda[0][0]
 
     def due_ns(self) -> int | None:
         """Return the time at which `step_to` must be called in real time, even without requests of hosts;
@@ -224,76 +243,44 @@ class Mechanics:
         if not self.still:
             return self.grid_ns + EAGER_NS
         agenda_ns = self._agenda[0][0] + STEP_NS if self._agenda else None
-        if self.strain.calm:
+        if self._state.calm:
             return agenda_ns
         easy_ns = self.grid_ns + EASY_NS
         return easy_ns if agenda_ns is None else min(easy_ns, agenda_ns)
 
     def step_to(self, now_ns: int) -> None:
         """Step all servos up to the last grid point at or before `now_ns`."""
-        if self._busy or self.grid_ns + STEP_NS > now_ns:
-            return
-        self._busy = True  # Callbacks may read the time, but must not advance it
-        try:
-            while self.grid_ns + STEP_NS <= now_ns:
-                self._advance_once(now_ns)
-        finally:
-            self._busy = False
+        while (answer := self._library.motion_step_to(self._address, now_ns)) != StepResult.DONE:
+            self._state.busy = True  # Callbacks may read the time, but must not advance it
+            try:
+                if answer == StepResult.ACTION:
+                    self._act()
+                elif answer == StepResult.STRAINED:
+                    self._call_watchers()
+                else:
+                    self._step()
+            finally:
+                self._state.busy = False
 
-    def _advance_once(self, now_ns: int) -> None:
-        """Do the actions that are due, then take one step or skip the steps in which nothing happens;
-        update temperatures if due."""
-        while self._agenda and self._agenda[0][0] <= self.grid_ns:
-            heapq.heappop(self._agenda)[2]()
-        if self.still or not self._motors:
-            self._skip(now_ns)
-        else:
-            if self._hands:
-                self._step_with_hands()
-            else:
-                self._step()
-            self.grid_ns += STEP_NS
-        if self.grid_ns >= self._next_strain_ns:
-            self._next_strain_ns = self._strain_after(self.grid_ns)
-            self._feel()
+    def _act(self) -> None:
+        _, _, action = heapq.heappop(self._agenda)
+        self._state.agenda_ns = self._agenda[0][0] if self._agenda else _NEVER
+        action()
 
-    def _skip(self, now_ns: int) -> None:
-        """Skip steps at once while all servos rest, up to the next action or change of temperature."""
-        until_ns = now_ns if self.strain.calm else min(now_ns, self._next_strain_ns)
-        if self._agenda:
-            until_ns = min(until_ns, self._agenda[0][0])
-        self.grid_ns += max(1, (until_ns - self.grid_ns) // STEP_NS) * STEP_NS
-
-    def _strain_after(self, t_ns: int) -> int:
-        return t_ns - (t_ns - self._start_ns) % STRAIN_NS + STRAIN_NS
+    def _call_watchers(self) -> None:
+        news = np.flatnonzero(self.servos["news"]).tolist()
+        self.servos["news"] = self._state.news = 0
+        for index in news:
+            if (act := self._watchers.get(index)) is not None:
+                act()
 
     def _step(self) -> None:
-        plant, profiles, law = self.plant, self.profiles, self.law
-        if self._commanded:
-            self._commanded = False
-            profiles.commanded()
-            law.commanded()
-        profiles.advance_trajectories()
-        law.compute_drive(profiles, plant.angle, plant.velocity)
-        if self._before is not None:
-            self._before = plant.velocity.copy()
-        # A check for rest needs copies of the arrays, so it is not made in every step.
-        if (self.grid_ns - self._start_ns) // STEP_NS % _STEPS_A_LOOK:
-            plant.step_shafts(law.drive, law.damping, STEP_NS * 1e-9)
-            return
-        before = plant.velocity.copy()
-        plant.step_shafts(law.drive, law.damping, STEP_NS * 1e-9)
-        profiles.check_arrival()
-        still = profiles.arrived and np.abs(plant.velocity).max() < _STILL and not law.winding
-        if still and np.abs(before - plant.velocity).max() < _UNDRIVEN:
-            plant.velocity.fill(0.0)
-            self.still = True
-
-    def _step_with_hands(self) -> None:
-        """Take one step in which shafts that are turned by hand follow the hand, unless the servo drives
-        them."""
+        """Take one step of a plant that is not in C, or one in which shafts that are turned by hand follow
+        the hand, unless the servo drives them."""
         angles = {index: self.plant.angle.item(index) for index in self._hands}
-        self._step()
+        self._library.motion_drive(self._address)
+        self.plant.step_shafts(self._drive, self._damping, self._state.step_s)
+        self._library.motion_check_rest(self._address)
         for index, angle in angles.items():
             hand, way = self._hands[index], self._hands[index].speed * STEP_NS * 1e-9
             if self._drives(index):
@@ -306,28 +293,19 @@ class Mechanics:
                 self.plant.velocity[index] = hand.speed
             else:
                 del self._hands[index]
+        self._state.hands = len(self._hands)
+        self._library.motion_end_step(self._address)
 
     def _drives(self, index: int) -> bool:
         """Return True if a servo is commanded to a position, a speed, or a torque other than 0."""
-        command = ServoCommand(*self._commands[:, index].tolist())
+        command = ServoCommand(*self._commands[index].item())
         able = command.limit > 0.0 and command.torque_limit > 0.0
         return able and any((command.bias, command.turning, command.p_ccw, command.p_cw))
 
-    def _feel(self) -> None:
-        if not self._motors:
-            return
-        most = self.law.stall * self._commands[ROWS["limit"]]
-        for index in self.strain.tick(self.law.torque, most):
-            if (act := self._watchers.get(index)) is not None:
-                act()
-
     def _wake(self) -> None:
-        self._commanded = True
-        self.strain.calm = False
-        self.still = False
+        self._state.calm = self._state.still = self._state.arrived = False
 
     def _build(self, angle: Floats, velocity: Floats) -> None:
-        count, dt_s = len(self._motors), STEP_NS * 1e-9
         self.plant: Plant = self._make_plant(
             [
                 PlantJoint(motor, load, each, recounted)
@@ -337,44 +315,18 @@ class Mechanics:
             ]
         )
         self.plant.velocity[:] = velocity
-        self._commands = np.tile(np.array([LIMP]).T, (1, count))
-        nominal = np.array([motor.stall_torque for motor in self._motors])
-        self.profiles = Profiles(self._commands, self.plant.angle, dt_s)
-        self.law = ControlLaw(self._commands, np.array([motor.damping for motor in self._motors]), dt_s)
-        self.law.stall[:] = nominal
-        self.strain = Strain(nominal, STRAIN_NS * 1e-9)
-        self._next_strain_ns = self._strain_after(self.grid_ns)
-
-
-class Strain:
-    """Temperature of each servo from the copper loss (current squared, [i]: one body), and duration of its
-    overload."""
-
-    def __init__(self, nominal_stall: Floats, dt_s: float) -> None:
-        size = len(nominal_stall)
-        self._nominal_stall = nominal_stall
-        self._part = dt_s / COOLING_S
-        self.temperature: Floats = np.full(size, AMBIENT_C)  # degrees C
-        self.overloaded = np.zeros(size, dtype=np.int64)  # Ticks since the beginning of the overload
-        self.calm = False  # True if the same load would change nothing any more
-
-    def tick(self, torque: Floats, most: Floats) -> list[int]:
-        """Update temperatures and overloads for one tick of STRAIN_NS; return the servos with a new
-        temperature or overload.
-
-        Args:
-            torque: Torque of each motor, Nm.
-            most: Torque at standstill that duty limit and supply allow, Nm.
-        """
-        shown = np.rint(self.temperature)
-        load = torque / self._nominal_stall
-        change = (AMBIENT_C + STALLED_RISE_C * load * load - self.temperature) * self._part
-        self.temperature += change
-        too_much = (np.abs(torque) >= OVERLOAD_PART * most) & (most > 0.0)
-        self.overloaded = np.where(too_much, self.overloaded + 1, 0)
-        self.calm = bool(np.abs(change).max() < _STEADY_C and not too_much.any())
-        news = (np.rint(self.temperature) != shown) | (self.overloaded == OVERLOAD_TICKS)
-        return np.flatnonzero(news).tolist() if news.any() else []
+        self._before, self._drive, self._damping = velocity.copy(), *np.zeros((2, len(velocity)))
+        self._commands, state, plant = self.servos[_COMMAND], self._state, self.plant
+        state.count, state.servos = len(self.servos), self.servos.ctypes.data
+        state.joints = plant.joints.ctypes.data if isinstance(plant, IndependentJoints) else None
+        for name, values in {
+            "angle": plant.angle,
+            "velocity": plant.velocity,
+            "before": self._before,
+            "drive": self._drive,
+            "damping": self._damping,
+        }.items():
+            setattr(state, name, values.ctypes.data)
 
 
 def plant_of(config: SimulationConfig) -> PlantMaker:

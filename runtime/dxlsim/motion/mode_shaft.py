@@ -113,11 +113,12 @@ class ModeShaft(Shaft):
         if not self._goes_to_goal:
             return self.angle
         ahead_s = max(0, self.now_ns - self.mechanics.grid_ns) * 1e-9
-        return float(self.mechanics.profiles.position[self.index]) + self._trajectory_speed * ahead_s
+        setpoint: float = self.mechanics.servos["setpoint"].item(self.index)
+        return setpoint + self._trajectory_speed * ahead_s
 
     @property
     def _trajectory_speed(self) -> float:
-        speed = float(self.mechanics.profiles.velocity[self.index])
+        speed = self.mechanics.servos["setpoint_velocity"].item(self.index)
         return speed if self._goes_to_goal or (self._last and self._last.turning) else 0.0
 
     def _moving_status(self) -> int:
@@ -125,7 +126,7 @@ class ModeShaft(Shaft):
             return _ARRIVED if not self.moving else 0
         if self._under_way:
             return self._profile_kind | _ON_THE_WAY
-        goal = float(self.mechanics.profiles.position[self.index])
+        goal = self.mechanics.servos["setpoint"].item(self.index)
         near = abs(goal - self.angle) <= _IN_POSITION_TICKS * self.memory.table.rad_per_tick
         return self._profile_kind | (_ARRIVED if near else 0)
 
@@ -216,7 +217,7 @@ class ModeShaft(Shaft):
         if not velocity:
             self._profile_kind = 0
             return goal, FREE, FREE
-        distance = abs(goal - float(self.mechanics.profiles.position[self.index]))
+        distance = abs(goal - self.mechanics.servos["setpoint"].item(self.index))
         if memory.get("drive_mode") & TIME_BASED:
             return self._timed(goal, distance, velocity * 1e-3, ramp * 1e-3)
         speed = velocity * table.rad_s_per_tick

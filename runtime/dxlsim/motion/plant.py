@@ -13,6 +13,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from dxlsim.motion.compiled_mechanics import JOINT, library
 from dxlsim.motion.motor import Motor
 from dxlsim.motor_model import Stribeck
 from dxlsim.simulation_plan import Load
@@ -38,11 +39,11 @@ class Plant(Protocol):
 
     @property
     def angle(self) -> Floats:
-        """Angle of each shaft, rad from the servo's raw 0; always the same array."""
+        """Angle of each shaft, rad from the servo's raw 0; always the same contiguous array."""
 
     @property
     def velocity(self) -> Floats:
-        """Speed of each shaft, rad/s, counter-clockwise positive; always the same array."""
+        """Speed of each shaft, rad/s, counter-clockwise positive; always the same contiguous array."""
 
     def step_shafts(self, drive: Floats, damping: Floats, dt_s: float) -> None:
         """Advance by `dt_s` with servo torque `drive - damping * velocity` (Nm, Nm s/rad)."""
@@ -66,49 +67,36 @@ servo is added later."""
 
 
 class IndependentJoints:
-    """Plant of shafts that do not affect each other.
+    """Plant of shafts that do not affect each other, with the friction of `Motor` and of `Load`.
 
-    The velocity is updated first, with implicit damping: stable at any damping and any step. That alone
-    would brake less than the motor does, as if dt / 2 of its damping were inertia (7 % for an MX-64).
-    Subtracting this from the inertia turns the step into Crank-Nicolson's. Friction is that of `Motor` and
-    of `Load`."""
+    `mechanics.c` has the step."""
 
     def __init__(self, joints: Sequence[PlantJoint]) -> None:
         self.angle: Floats = np.array([joint.angle for joint in joints], dtype=np.float64)
         self.velocity: Floats = np.zeros(len(joints))
-        self._inertia = np.array([each.motor.inertia + each.load.inertia for each in joints])
-        self._own_damping = np.array([each.motor.damping + each.motor.viscous_friction for each in joints])
-        self._friction = np.array([each.motor.friction + each.load.friction for each in joints])
-        self._load_friction = np.array([each.motor.load_friction for each in joints])
-        self._viscous_friction = np.array([each.motor.viscous_friction for each in joints])
-        self._gravity = np.array([each.load.gravity for each in joints])
-        self._down = np.array([each.load.gravity_angle + each.recounted for each in joints])
-        self._turns = np.array([each.load.turns for each in joints])
-        self._steady = np.array([each.load.steady for each in joints])
-        self._stribeck = Stribecks(joints) if any(each.motor.stribeck for each in joints) else None
-        self._free_friction = self._friction.copy()
-        self._dt_s = 0.0
+        self.joints = np.zeros(len(joints), dtype=JOINT)
+        """Struct `Joint` of mechanics.c for each shaft."""
+        for row, joint in zip(self.joints, joints, strict=True):
+            motor, load = joint.motor, joint.load
+            row["inertia"] = motor.inertia + load.inertia
+            row["damping"] = motor.damping + motor.viscous_friction
+            row["friction"] = motor.friction + load.friction
+            row["load_friction"], row["viscous_friction"] = motor.load_friction, motor.viscous_friction
+            row["gravity"], row["steady"], row["turns"] = load.gravity, load.steady, load.turns
+            row["down"] = load.gravity_angle + joint.recounted
+        self.joints["stribeck"] = stribecks(joints)
+        self._free_friction = self.joints["friction"].copy()
+        self._step = library().motion_step_joints
+        self._arrays = [each.ctypes.data for each in (self.joints, self.angle, self.velocity)]
 
     def step_shafts(self, drive: Floats, damping: Floats, dt_s: float) -> None:
         """Advance by `dt_s` with servo torque `drive - damping * velocity` (Nm, Nm s/rad)."""
-        if dt_s != self._dt_s:
-            self._set_step(dt_s)
-        velocity, per_torque = self.velocity, self._per_torque
-        pull = np.sin((self.angle - self._down) * self._turns) * self._gravity + self._steady
-        # The torque between motor and load, which load friction depends on.
-        most = np.abs(drive - damping * velocity + pull) * (self._load_friction * per_torque)
-        most += self._friction * per_torque
-        if self._stribeck is not None:
-            most += self._stribeck.friction(velocity) * per_torque
-        free = velocity + (drive - pull) * per_torque  # Velocity without friction and damping
-        # Friction removes at most the whole velocity: a joint that it stops stays at rest.
-        rubbed = free - np.maximum(np.minimum(free, most), -most)
-        velocity[:] = rubbed / (per_torque * damping + self._undamped)
-        self.angle += velocity * dt_s
+        drive, damping = np.ascontiguousarray(drive), np.ascontiguousarray(damping)
+        self._step(*self._arrays, drive.ctypes.data, damping.ctypes.data, len(self.joints), dt_s)
 
     def jam(self, index: int, on: bool) -> None:
         """Block a shaft at its present angle, or release it."""
-        self._friction[index] = JAMMED_NM if on else self._free_friction[index]
+        self.joints["friction"][index] = JAMMED_NM if on else self._free_friction[index]
 
     def place_shaft(self, index: int, angle: float) -> None:
         """Move a resting shaft to an angle, rad, at once."""
@@ -118,14 +106,7 @@ class IndependentJoints:
     def shift_angle(self, index: int, by: float) -> None:
         """Add `by`, rad, to the angle count of a resting shaft, which does not move."""
         self.angle[index] += by
-        self._down[index] += by
-
-    def _set_step(self, dt_s: float) -> None:
-        self._dt_s = dt_s
-        # At least half: the correction does not improve a step as long as the motor's time constant.
-        inertia = np.maximum(self._inertia - self._own_damping * dt_s / 2, self._inertia / 2)
-        self._per_torque: Floats = dt_s / inertia
-        self._undamped: Floats = 1.0 + self._viscous_friction * self._per_torque
+        self.joints["down"][index] += by
 
 
 class SeveralPlants:
@@ -184,16 +165,8 @@ def combine_plants(joints: Sequence[PlantJoint], parts: Sequence[Part]) -> Plant
     return plant if [*rows] == [*range(len(joints))] else SeveralPlants(joints, parts)
 
 
-class Stribecks:
-    """Additional friction near standstill (Stribeck effect) of several joints at once."""
-
-    def __init__(self, joints: Sequence[PlantJoint]) -> None:
-        parts = [joint.motor.stribeck or Stribeck(0.0, 1.0) for joint in joints]
-        self._most = np.array([part.friction for part in parts])
-        self._speed = np.array([part.velocity for part in parts])
-        self._exponent = np.array([part.exponent for part in parts])
-
-    def friction(self, velocity: Floats) -> Floats:
-        """Return the additional friction of each joint, Nm, at its velocity, rad/s."""
-        friction: Floats = self._most * np.exp(-((np.abs(velocity) / self._speed) ** self._exponent))
-        return friction
+def stribecks(joints: Sequence[PlantJoint]) -> Floats:
+    """Return the Stribeck friction of each joint, as rows of Nm, rad/s and exponent; 0 Nm: none."""
+    parts = [joint.motor.stribeck or Stribeck(0.0, 1.0) for joint in joints]
+    rows = [(part.friction, part.velocity, part.exponent) for part in parts]
+    return np.array(rows, dtype=np.float64).reshape(-1, 3)

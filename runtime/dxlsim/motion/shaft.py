@@ -54,12 +54,14 @@ class Shaft(ABC):
     @property
     def current(self) -> float:
         """Current of the motor, A, positive when it drives counter-clockwise."""
-        return self.mechanics.law.torque.item(self.index) / self._torque_per_ampere
+        torque: float = self.mechanics.servos["torque"].item(self.index)
+        return torque / self._torque_per_ampere
 
     @property
     def duty(self) -> float:
         """Fraction of the supply voltage at the motor, -1 to 1."""
-        return self.mechanics.law.duty.item(self.index)
+        duty: float = self.mechanics.servos["duty"].item(self.index)
+        return duty
 
     @property
     def moving(self) -> bool:
@@ -162,7 +164,7 @@ class Shaft(ABC):
 
     @property
     def _under_way(self) -> bool:
-        return self._goes_to_goal and not self.mechanics.profiles.at_goal(self.index)
+        return self._goes_to_goal and not self.mechanics.at_goal(self.index)
 
 
 def in_turn(angle: float) -> float:

@@ -195,7 +195,8 @@ class SimulatedServo(SimulatedNode):
     @property
     def temperature(self) -> float:
         """Temperature of the servo, degrees C."""
-        return float(self.shaft.mechanics.strain.temperature[self.shaft.index])
+        celsius: float = self.shaft.mechanics.servos["temperature"].item(self.shaft.index)
+        return celsius
 
     @temperature.setter
     def temperature(self, celsius: float) -> None:

@@ -337,14 +337,14 @@ def show(story: Story, joint: str, shown: dict[str, Callable[[], int]]) -> bool:
 def never_overload(story: Story, _: float, joint: str) -> None:
     """As a servo whose Shutdown is off: what is seen is the fault itself."""
     shaft = story.servo(joint).shaft
-    shaft.mechanics.strain.overloaded[shaft.index] = 0
+    shaft.mechanics.servos["overloaded"][shaft.index] = 0
 
 
 @line("<joint> has a bag of <n> Nm to carry", then)
 def hang_a_bag(story: Story, joint: str, torque: float) -> None:
     shaft = story.servo(joint).shaft
     plant, index = shaft.mechanics.plant, shaft.index
-    plant._gravity[index], plant._down[index], plant._has_gravity = torque, plant.angle[index] - 1.4, True
+    plant.joints["gravity"][index], plant.joints["down"][index] = torque, plant.angle[index] - 1.4
     shaft.mechanics._wake()
 
 

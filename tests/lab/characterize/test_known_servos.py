@@ -20,7 +20,6 @@ from dxlrun_lab.characterize.trace import Trace
 from dxlrun_lab.guided.segment import Segment
 from dxlsim.bus.ledger import Ledger
 from dxlsim.bus.simulated_bus import SimulatedBus
-from dxlsim.motion.control_law import ROWS
 from dxlsim.motion.motor import motor_of
 from dxlsim.servo.simulated_servo import SimulatedServo
 from dxlsim.simulation_plan import BusConfig, Load, ServoConfig, ServoTimes
@@ -201,10 +200,10 @@ def resting_error(bus: SimulatedBus, friction: float) -> float:
 
     The motor holds while p (e - margin) + punch <= friction, which grows by load_friction of its torque.
     """
-    motor, commands = motor_of(bus.servo(1).registers.table), bus.mechanics._commands[:, 0]
+    motor, servo = motor_of(bus.servo(1).registers.table), bus.mechanics.servos[0]
     held = (motor.friction + friction) / (1 - motor.load_friction) / motor.stall_torque
-    error = (held - commands[ROWS["punch"]]) / commands[ROWS["p_ccw"]]
-    return float(commands[ROWS["margin_ccw"]] + max(0.0, error))
+    error = (held - servo["punch"]) / servo["p_ccw"]
+    return float(servo["margin_ccw"] + max(0.0, error))
 
 
 @known(

@@ -1,0 +1,317 @@
+/* Mechanics: motion of all servos of one simulation, in steps of one time grid. `mechanics.py` fills the structs.
+ *
+ * In each step the trajectories give the setpoints of the servos' controllers, the control law gives the torque of
+ * the motors, and the plant gives the motion. All families share the law; each one uses some of its terms:
+ *
+ *     duty = p * error beyond the margin + punch + i * its integral + d * its speed + feed-forward + bias
+ *
+ * clamped to `limit`; with current control the torque is also clamped to `torque_limit`. A velocity controller is the
+ * same law on the integrated speed: its I gain takes the place of P, its P gain that of D. The motor's torque is
+ * `duty * stall torque - damping * velocity`.
+ *
+ * Arithmetic is IEEE double in source order, built with -ffp-contract=off, so that a simulation has the same bits on
+ * every machine with the same `sin`, `exp` and `pow`. NaN spreads through `least` and `most`, as in numpy.
+ */
+
+#include <math.h>
+#include <stdint.h>
+
+#ifndef SOURCE_CRC
+#define SOURCE_CRC 0 /* CRC-32 of this file. mechanics.py parses the structs here, and refuses an outdated object. */
+#endif
+#define ARRIVED 1e-9 /* rad; distance to the goal at which a trajectory ends */
+#define UNWOUND 1e-6 /* duty/s; an integral that changes the duty more slowly counts as constant */
+#define LEAST_P 1e-9 /* duty per rad; bounds the integrated speed error of a velocity controller with a tiny gain */
+#define STEPS_A_LOOK 16 /* steps between two checks for rest */
+#define STILL 1e-6      /* rad/s; a servo rests below it, and below UNDRIVEN */
+#define UNDRIVEN 1e-8   /* rad/s, change of the speed in a step */
+#define STEADY_C 1e-7   /* degrees C in a tick; a smaller change has no visible effect in years */
+
+enum { DONE, ACTION, STRAINED, STEP }; /* results of motion_step_to: `StepResult` of compiled_mechanics.py */
+
+typedef struct { /* one servo: its command, trajectory, controller, motor and temperature; angles are the shaft's */
+    double goal, speed, acceleration, turning, p_ccw, p_cw, margin_ccw, margin_cw, punch; /* ServoCommand of */
+    double i, d, feed_velocity, feed_acceleration, bias, limit, torque_limit;             /* control_law.py */
+    double setpoint, setpoint_velocity; /* rad and rad/s of the trajectory */
+    double setpoint_change;             /* change of its velocity in the last step, rad/s */
+    double stall;                       /* torque at standstill and full duty, at the supply voltage, Nm */
+    double motor_damping;               /* Nm s/rad */
+    double error;                       /* rad between setpoint and shaft in the last step */
+    double integral;                    /* rad s */
+    double torque;                      /* Nm of the motor at the speed before the last step */
+    double duty;                        /* signed fraction of the supply voltage at the motor */
+    double nominal_stall;               /* `stall` at the nominal voltage, Nm */
+    double temperature;                 /* degrees C */
+    int64_t overloaded;                 /* ticks of the strain since the beginning of the overload */
+    int32_t within;                     /* 1: the duty is below its limit */
+    int32_t news;                       /* 1: the temperature has changed by a degree, or an overload lasts too long */
+} Servo;
+
+typedef struct { /* one shaft of IndependentJoints with its motor and load, as PlantJoint of plant.py */
+    double inertia;                       /* kg m^2 of motor and load */
+    double damping, viscous_friction;     /* Nm s/rad: of the motor with its viscous friction; the latter alone */
+    double friction, load_friction;       /* Nm; Nm per Nm of torque between motor and load */
+    double gravity, down, turns, steady;  /* Nm; rad where the load hangs; load turns per turn; Nm */
+    double stribeck[3];                   /* Nm, rad/s, exponent; 0 Nm: none */
+} Joint;
+
+typedef struct {
+    Servo *servos;
+    Joint *joints;          /* NULL: the plant is not IndependentJoints, so Python steps it */
+    double *angle, *velocity; /* of the plant, rad and rad/s */
+    double *before;         /* velocities before the last step */
+    double *drive, *damping; /* torque of the servos for the plant: drive - damping * velocity; Nm, Nm s/rad */
+    int64_t count;          /* number of servos */
+    int64_t step_ns, strain_step_ns;  /* steps of the grid and of the strain */
+    int64_t start_ns, grid_ns;        /* time of the first and the last step */
+    int64_t strain_ns, agenda_ns;     /* next time of the strain, and of an action of Python; INT64_MAX: none */
+    double step_s, strain_part;       /* `step_ns` in s; a tick of the strain as a fraction of its time constant */
+    double ambient_c, stalled_rise_c; /* degrees C: see mechanics.py */
+    double overload_part;             /* fraction of the torque allowed by the limit, above it is an overload */
+    int64_t overload_ticks;           /* tolerated duration of an overload */
+    int32_t hands;          /* number of shafts that are turned by hand, which Python does */
+    int32_t busy;           /* 1: Python acts, and may read the time but not advance it */
+    int32_t still;          /* 1: all servos rest without new commands */
+    int32_t arrived;        /* 1: no trajectory moves */
+    int32_t calm;           /* 1: the same load would change no temperature any more */
+    int32_t news;           /* 1: a servo has `news` */
+} Mechanics;
+
+uint32_t dxl_source(void)
+{
+    return SOURCE_CRC;
+}
+
+static double least(double a, double b)
+{
+    return isnan(a) || a < b ? a : b;
+}
+
+static double most(double a, double b)
+{
+    return isnan(a) || a > b ? a : b;
+}
+
+static double clamp(double value, double limit)
+{
+    return most(least(value, limit), -limit);
+}
+
+/* Advance a trajectory by one step.
+ *
+ * The speed is limited by the profile's speed, and changes with the profile's acceleration (e-Manual, X series, Profile
+ * Velocity (112)). The manual's jerk control is not modelled. A new goal starts with the current velocity of the
+ * trajectory ("Velocity Override"). */
+static void follow(Servo *s, double dt)
+{
+    double error = s->goal - s->setpoint, way = fabs(error), ramp = s->acceleration * dt;
+    /* Braking by a dt in each of n steps from v takes n v - n (n - 1) / 2 a dt, in steps of dt. Choose the least n with
+     * which the rest of the way can end at rest, and the v that ends exactly there. */
+    double steps = most(ceil((sqrt(way * (8 / (ramp * dt)) + 1.0) - 1.0) * 0.5), 1.0);
+    double speed = (steps - 1.0) * (ramp / 2) + way * (1.0 / dt) / steps;
+    speed = s->turning != 0.0 ? s->speed : copysign(least(speed, s->speed), error);
+    s->setpoint_change = clamp(speed - s->setpoint_velocity, ramp);
+    s->setpoint_velocity += s->setpoint_change;
+    s->setpoint += s->setpoint_velocity * dt;
+}
+
+/* Compute the torque of a servo for its setpoint and the shaft's angle and velocity. */
+static void control(Servo *s, double angle, double velocity, double dt, double *drive, double *damping)
+{
+    double error = s->setpoint - angle;
+    if (s->turning != 0.0) {
+        /* Anti-windup: the integrated speed error stops at the value that requires the full limit. */
+        if (s->p_ccw > 0.0)
+            error = clamp(error, s->limit / most(s->p_ccw, LEAST_P));
+        s->setpoint = angle + error;
+    }
+    int ccw = error > 0.0;
+    double beyond = fabs(error) - (ccw ? s->margin_ccw : s->margin_cw);
+    double wanted = most(beyond, 0.0) * (ccw ? s->p_ccw : s->p_cw) + (beyond > 0.0 ? s->punch : 0.0);
+    wanted = copysign(wanted, error) + (s->d + s->feed_velocity) * s->setpoint_velocity + s->bias;
+    wanted = wanted + s->feed_acceleration * s->setpoint_change / dt + s->i * s->integral;
+    double undamped = wanted;
+    wanted = undamped - s->d * velocity;
+    s->duty = clamp(wanted, s->limit);
+    s->error = error;
+    s->within = wanted == s->duty;
+    /* At the limit the controller's own damping has no effect. Elsewhere the plant applies it. */
+    *drive = (s->within ? undamped : s->duty) * s->stall;
+    *damping = (s->within ? s->d * s->stall : 0.0) + s->motor_damping;
+    if (s->i != 0.0 && s->within)
+        s->integral += error * dt;
+    s->torque = *drive - *damping * velocity;
+    if (fabs(s->torque) > s->torque_limit) { /* only for a motor whose current is controlled */
+        *drive = s->torque = clamp(s->torque, s->torque_limit);
+        *damping = 0.0;
+    }
+}
+
+/* Additional friction near standstill, Nm (Stribeck effect). */
+static double near_standstill(const double stribeck[3], double velocity)
+{
+    return stribeck[0] * exp(-pow(fabs(velocity) / stribeck[1], stribeck[2]));
+}
+
+void motion_stribeck(const double *stribeck, const double *velocity, double *friction, int64_t count)
+{
+    for (int64_t i = 0; i < count; i++)
+        friction[i] = near_standstill(stribeck + 3 * i, velocity[i]);
+}
+
+/* Advance shafts that do not affect each other by `dt` s with servo torque `drive - damping * velocity`.
+ *
+ * The velocity is updated first, with implicit damping: stable at any damping and any step. That alone would brake less
+ * than the motor does, as if dt / 2 of its damping were inertia (7 % for an MX-64). Subtracting this from the inertia
+ * turns the step into Crank-Nicolson's. At least half of the inertia is kept: the correction does not improve a step as
+ * long as the motor's time constant. */
+void motion_step_joints(const Joint *joints, double *angle, double *velocity, const double *drive,
+                        const double *damping, int64_t count, double dt)
+{
+    for (int64_t i = 0; i < count; i++) {
+        const Joint *j = &joints[i];
+        double per_torque = dt / most(j->inertia - j->damping * dt / 2, j->inertia / 2);
+        double pull = j->steady;
+        if (j->gravity != 0.0)
+            pull = sin((angle[i] - j->down) * j->turns) * j->gravity + j->steady;
+        /* The torque between motor and load, which load friction depends on. */
+        double holds = fabs(drive[i] - damping[i] * velocity[i] + pull) * (j->load_friction * per_torque);
+        holds += j->friction * per_torque;
+        if (j->stribeck[0] != 0.0)
+            holds += near_standstill(j->stribeck, velocity[i]) * per_torque;
+        double free = velocity[i] + (drive[i] - pull) * per_torque; /* velocity without friction and damping */
+        /* Friction removes at most the whole velocity: a joint that it stops stays at rest. */
+        double rubbed = free - clamp(free, holds);
+        velocity[i] = rubbed / (per_torque * damping[i] + (1.0 + j->viscous_friction * per_torque));
+        angle[i] += velocity[i] * dt;
+    }
+}
+
+/* First half of a step: advance the trajectories, and compute the torques of the servos. */
+void motion_drive(Mechanics *m)
+{
+    for (int64_t i = 0; i < m->count; i++) {
+        Servo *s = &m->servos[i];
+        m->before[i] = m->velocity[i];
+        if (!m->arrived)
+            follow(s, m->step_s);
+        control(s, m->angle[i], m->velocity[i], m->step_s, &m->drive[i], &m->damping[i]);
+    }
+}
+
+int32_t motion_at_goal(const Servo *s)
+{
+    return s->turning != 0.0 ? s->setpoint_velocity == s->speed : fabs(s->goal - s->setpoint) < ARRIVED;
+}
+
+/* Set trajectories exactly to their goals, and stop stepping them, if all have ended. */
+static void check_arrival(Mechanics *m)
+{
+    for (int64_t i = 0; i < m->count; i++) {
+        const Servo *s = &m->servos[i];
+        if (s->turning != 0.0 || !motion_at_goal(s) || !(fabs(s->setpoint_velocity) < ARRIVED / m->step_s))
+            return;
+    }
+    for (int64_t i = 0; i < m->count; i++) {
+        Servo *s = &m->servos[i];
+        s->setpoint = s->goal;
+        s->setpoint_velocity = s->setpoint_change = 0.0;
+    }
+    m->arrived = 1;
+}
+
+/* After the plant's half of a step: mark the servos as still if they all rest. A check in every step would cost more
+ * than the steps that it saves. */
+void motion_check_rest(Mechanics *m)
+{
+    if ((m->grid_ns - m->start_ns) / m->step_ns % STEPS_A_LOOK)
+        return;
+    if (!m->arrived)
+        check_arrival(m);
+    if (!m->arrived)
+        return;
+    for (int64_t i = 0; i < m->count; i++) {
+        const Servo *s = &m->servos[i];
+        /* An integral that changes may still move a shaft that friction holds. */
+        int winds = s->within && fabs(s->i * s->error) > UNWOUND;
+        double velocity = m->velocity[i];
+        if (winds || !(fabs(velocity) < STILL) || !(fabs(m->before[i] - velocity) < UNDRIVEN))
+            return;
+    }
+    for (int64_t i = 0; i < m->count; i++)
+        m->velocity[i] = 0.0;
+    m->still = 1;
+}
+
+/* Update temperatures and overloads. A temperature follows the copper loss: current squared, housing and winding as one
+ * body [i]. */
+static void strain(Mechanics *m)
+{
+    m->calm = 1;
+    for (int64_t i = 0; i < m->count; i++) {
+        Servo *s = &m->servos[i];
+        double shown = rint(s->temperature), load = s->torque / s->nominal_stall;
+        double change = (m->ambient_c + m->stalled_rise_c * load * load - s->temperature) * m->strain_part;
+        double allowed = s->stall * s->limit; /* at standstill, by duty limit and supply */
+        int too_much = fabs(s->torque) >= m->overload_part * allowed && allowed > 0.0;
+        s->temperature += change;
+        s->overloaded = too_much ? s->overloaded + 1 : 0;
+        if (too_much || !(fabs(change) < STEADY_C))
+            m->calm = 0;
+        if (rint(s->temperature) != shown || s->overloaded == m->overload_ticks)
+            m->news = s->news = 1;
+    }
+}
+
+static void end_step(Mechanics *m, int64_t steps)
+{
+    m->grid_ns += steps * m->step_ns;
+    if (m->grid_ns < m->strain_ns)
+        return;
+    m->strain_ns = m->grid_ns - (m->grid_ns - m->start_ns) % m->strain_step_ns + m->strain_step_ns;
+    if (m->count)
+        strain(m);
+}
+
+/* Last part of a step whose plant Python has stepped. */
+void motion_end_step(Mechanics *m)
+{
+    end_step(m, 1);
+}
+
+/* Number of steps to skip while all servos rest: up to the next action or change of temperature. */
+static int64_t resting_steps(const Mechanics *m, int64_t now_ns)
+{
+    int64_t until_ns = m->agenda_ns < now_ns ? m->agenda_ns : now_ns;
+    if (!m->calm && m->strain_ns < until_ns)
+        until_ns = m->strain_ns;
+    int64_t steps = (until_ns - m->grid_ns) / m->step_ns;
+    return steps > 1 ? steps : 1;
+}
+
+/* Step all servos up to the last grid point at or before `now_ns`. Returns earlier where Python has to act: an action
+ * is due, a servo has news, or Python takes a step. Then the same call continues after it. */
+int32_t motion_step_to(Mechanics *m, int64_t now_ns)
+{
+    if (m->busy)
+        return DONE;
+    if (m->news)
+        return STRAINED;
+    while (m->grid_ns + m->step_ns <= now_ns) {
+        if (m->agenda_ns <= m->grid_ns)
+            return ACTION;
+        if (m->still || !m->count)
+            end_step(m, resting_steps(m, now_ns));
+        else if (!m->joints || m->hands)
+            return STEP;
+        else {
+            motion_drive(m);
+            motion_step_joints(m->joints, m->angle, m->velocity, m->drive, m->damping, m->count, m->step_s);
+            motion_check_rest(m);
+            end_step(m, 1);
+        }
+        if (m->news)
+            return STRAINED;
+    }
+    return DONE;
+}
