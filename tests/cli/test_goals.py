@@ -15,7 +15,7 @@ from tests.kit.commands import Case, Dxlrun, Stage, cases, play
 
 from dxlrun.cli.steering import goals, parameters, steer
 from dxlrun.cli.steering import play as play_room
-from dxlrun.errors import DxlrunError, GoalTimeout, Refused
+from dxlrun.errors import DxlrunError, Refused
 from dxlrun.remote.client import Executed, RemoteGoal
 from dxlrun.remote.requests.replies import GoalState, Parameter
 
@@ -51,6 +51,7 @@ class Robot:
         self.drawn: list[str] = []
         """Texts and progress of the progress bar"""
         self.ended: set[int] = set()
+        self.cancelled_once: set[int] = set()
         self.mistakes: list[tuple[str, str, str]] = []
         self.goals_begin = True
         self.file = Path("/nowhere/torso.yaml")
@@ -79,6 +80,8 @@ class Robot:
         what, _, rest = line.partition(" ")
         if what == "cancel":
             self.ended.add(int(rest))
+        elif what == "again":
+            self.cancelled_once.add(int(rest))
         else:
             place, _, sentence = rest.partition(" ")
             self.mistakes.append((place, *sentence.split("; ")))  # type: ignore[arg-type]
@@ -126,16 +129,18 @@ class Robot:
             raise found
         return found
 
-    def wait(self, number: int, timeout: float) -> GoalState:
+    def wait(self, number: int) -> GoalState:
         self.requests.append(f"wait {number}")
         for _ in range(10):
             if (found := self.goal_state(number)).status != "running":
                 return found
-        raise GoalTimeout(f"goal {number} of arm has not ended within 10 s")
+        raise AssertionError("this waits for ever")
 
     def cancel(self, goal: int) -> Executed:
         if goal in self.ended:
             raise Refused(f"goal {goal} has ended already: reached", code="goal_ended")
+        if f"cancel {goal}" in self.requests and goal in self.cancelled_once:
+            raise Refused(f"goal {goal} is being cancelled already", code="cancelled_already")
         self.requests.append(f"cancel {goal}")
         return Executed(8)
 

@@ -139,6 +139,7 @@ class Stage:
             keep=self.keeps.append,
             take_over=lambda names, why: self.takeovers.append((tuple(names), why)),
             end_run=self.endings.append,
+            begin_goal=self._begin_goal,
         )
         self.states, self.commands, self.sent = (
             self.context.states,
@@ -193,11 +194,14 @@ class Stage:
         if kind not in self.type.Goals:
             self.controller.on_command(kind, data, self.time_ns)
             return
+        self.controller.on_goal(self._begin_goal(kind), data, self.time_ns)
+
+    def _begin_goal(self, kind: str) -> Goal:
         if self.goals and self.goal.outcome is None:
             self.goal.end(Outcome.PREEMPTED)
         self.goals.append(Goal(self.judge, len(self.goals) + 1, kind))
         self.judge.running[self.goal.number] = self.goal
-        self.controller.on_goal(self.goal, data, self.time_ns)
+        return self.goal
 
     def cancel(self, at_s: float | None = None) -> None:
         self._at(at_s)

@@ -135,7 +135,8 @@ class KeyframeParameters(ParametersModel):
     partial: bool = False
     """If true, joints without torque are skipped. If false, all joints must have torque."""
     start: str | None = None
-    """Motion that starts whenever the controller is activated, except after a joint has regained torque."""
+    """Motion that starts whenever the controller is activated, as a goal, except after a joint has regained
+    torque."""
 
     def mistakes(self) -> Iterator[Mistake]:
         """Yield unknown names of motions and joints, and motions whose exits form a circle."""
@@ -466,10 +467,10 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         """Start the motion `start` once all joints have answered."""
         if self._unknown:
             self._hold_where_heard()
-        if not self._unknown and self.parameters.start is not None:
-            self._begin_motion(
-                self.parameters.start, 1.0, self.parameters.motions[self.parameters.start].repeat
-            )
+        name = self.parameters.start
+        if not self._unknown and name is not None:
+            self._goal = self.context.begin_goal("play")
+            self._begin_motion(name, 1.0, self.parameters.motions[name].repeat)
 
     def _hold_where_heard(self) -> None:
         """Hold joints that had not answered at the activation at their first measured positions."""

@@ -270,6 +270,10 @@ def _end_nothing(why: str) -> None:
     raise ControllerFault("requested the end of the run outside of a run")
 
 
+def _begin_no_goal(kind: str) -> Goal:
+    raise ControllerFault("began a goal outside of a run")
+
+
 def _set_no_registers(values: Mapping[str, Mapping[str, int | str]]) -> None:
     raise ControllerFault("set registers outside of a run")
 
@@ -349,6 +353,9 @@ class Context(msgspec.Struct, frozen=True):
     with conflicting claims leave, and so do the ones above these. Controllers that enter are updated in the
     same cycle, unless their joints must change their modes first. Active ones stay active. An event reports
     the takeover or its refusal."""
+    begin_goal: Callable[[str], Goal] = _begin_no_goal
+    """Begin a goal of a kind in `Goals` for a motion that the controller starts without a client's command.
+    Clients see it and can cancel it. An active goal is preempted."""
     set_registers: Callable[[Mapping[str, Mapping[str, int | str]]], None] = _set_no_registers
     """Set registers of the joints' servos, by joint and item, to values in `Interfaces.registers`.
 

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from dxlrun.remote.client import Executed, RemoteRobot
     from dxlrun.remote.requests.replies import GoalState
 
-REST_S = 10.0
-"""Timeout, s, for the joints of a cancelled goal to come to rest."""
 MOST_JOINTS = 3
 """Upper limit of the joints that a result or a list names; more are abbreviated."""
 _PROGRESS_S = 0.1
@@ -108,8 +106,8 @@ def cancel(goal: str = "", /, *, wait: WaitFlag = False, chosen: RobotChoice = O
     goal
         Number of a goal, or name of a controller. Default: all active goals.
     wait
-        Wait until the joints are at rest. With --no-wait, return as soon as the loop has accepted the
-        request.
+        Wait until the joints are at rest, also through exits. With --no-wait, return as soon as the loop has
+        accepted the request.
     """
     from dxlrun.channels.answers import Code
 
@@ -136,7 +134,7 @@ def cancel(goal: str = "", /, *, wait: WaitFlag = False, chosen: RobotChoice = O
             cancelled.append(number)
         if wait:
             for number in cancelled:
-                robot.wait(number, REST_S)
+                robot.wait(number)
         if chosen.as_json:
             show_json({"robot": robot.name, "goals": cancelled})
         elif not cancelled:
@@ -231,32 +229,35 @@ def _ended(robot: RemoteRobot, numbers: Sequence[int], motion: str, *, hidden: b
 
 
 def cancel_goals(robot: RemoteRobot, numbers: Sequence[int]) -> list[GoalState]:
-    """Cancel goals, wait until their joints are at rest or REST_S, and return their final states.
+    """Cancel goals, wait until their joints are at rest, and return their final states.
 
-    Ctrl-C during the wait cancels them again, which stops motions that are playing their exits. Errors are
-    printed; a goal without a result is not returned.
+    Ctrl-C during the wait cancels them again, which stops motions that are playing their exits, and does not
+    wait for others. Errors are printed; a goal without a result is not returned.
     """
     try:
         return _cancel_once(robot, numbers)
     except KeyboardInterrupt:
-        return _cancel_once(robot, numbers)
+        return _cancel_once(robot, numbers, again=True)
 
 
-def _cancel_once(robot: RemoteRobot, numbers: Sequence[int]) -> list[GoalState]:
+def _cancel_once(robot: RemoteRobot, numbers: Sequence[int], *, again: bool = False) -> list[GoalState]:
+    from dxlrun.channels.answers import Code
+
+    states, ending = [], []
     for number in numbers:
         try:
             robot.cancel(number)
         # The goal has ended in the meantime, or is already being cancelled.
-        except Refused:
-            continue
+        except Refused as refused:
+            if again and refused.code == Code.CANCELLED_ALREADY:
+                continue
         except DxlrunError as error:
             print_error(f"dxlrun: {error}")
             return []
-    until = time.monotonic() + REST_S
-    states = []
-    for number in numbers:
+        ending.append(number)
+    for number in ending:
         try:
-            states.append(robot.wait(number, max(0.0, until - time.monotonic())))
+            states.append(robot.wait(number))
         except DxlrunError as error:
             print_error(f"dxlrun: {error}")
     return states

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from dxlrun.channels.cycle import Floats
 from dxlrun.channels.event_records import EventSink, EventText
 from dxlrun.channels.heartbeat import ControllerMethod
-from dxlrun.contract.controller import Context, Controller, JointLimits, Outcome
+from dxlrun.contract.controller import Context, Controller, Goal, JointLimits, Outcome
 from dxlrun.control import texts
 from dxlrun.control.context import ControlContext
 from dxlrun.control.controllers.activity import Activity
@@ -103,6 +103,8 @@ class ControllersContext(msgspec.Struct, frozen=True, kw_only=True):
     """Destination of the controllers' messages."""
     keeping: StateKeeper
     registers: ChangedRegisters
+    begin_goal: Callable[[str, str], Goal]
+    """Begins a goal of the named controller, of a kind, which no client requested."""
     requests: list[ControllerRequest]
     """Takeovers and ends of the run that controllers requested in this cycle; not executed yet."""
 
@@ -196,6 +198,7 @@ class ManagedController:
             urdf=run.plan.urdf,
             provided=np.zeros(0) if self.provided is None else self.provided.own,
             source_commands=self._outputs.source_commands,
+            begin_goal=partial(self._shared.begin_goal, plan.name),
             set_registers=self._set_registers,
             take_over=partial(_take_over, requests, plan),
             end_run=partial(_end_run, requests, plan),

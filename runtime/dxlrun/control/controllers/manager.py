@@ -81,6 +81,7 @@ class Manager:
             topics=self._topics,
             keeping=self._keeping,
             registers=self.registers,
+            begin_goal=self._begin_own_goal,
             requests=self._requests,
         )
         self._schedule = context.schedule
@@ -285,6 +286,8 @@ class Manager:
             self._command_log.record_command(taken)
             self._next += 1
             pursued = self._pursue(command)
+            if pursued is not None and pursued.outcome is not None:
+                continue  # cancelled, or another command has taken over
             answer = self.dispatch_command(CommandMessage(place, name, kind, command.data, origin), pursued)
             if isinstance(answer, Refusal):
                 event = texts.command_refused(kind, origin, answer.text)
@@ -391,6 +394,15 @@ class Manager:
     ) -> int | Refusal:
         goal = self._accept(managed, kind, origin)
         return self._attempt(managed, managed.begin_goal, goal, data) or goal.number
+
+    def _begin_own_goal(self, controller: str, kind: str) -> RunningGoal:
+        """Accept a goal that a controller begins itself. Raises ControllerFault for a kind without goals."""
+        managed = self._named[controller]
+        if kind not in managed.controller.Goals:
+            raise ControllerFault(f"began a goal {kind}, which is not in its Goals")
+        goal = self._accept(managed, kind, controller)
+        managed.adopt_goal(goal)
+        return goal
 
     def cancel_goal(self, number: int, controller: str) -> Refusal | None:
         """Cancel the running goal of a controller, or the goal `number` if `controller` is empty.
