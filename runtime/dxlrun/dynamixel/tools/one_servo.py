@@ -59,6 +59,7 @@ _KEPT: Mapping[Reset, str] = {
     Reset.KEEP_ID: "baud rate too; the ID stays",
     Reset.KEEP_ID_AND_BAUD_RATE: "ID and baud rate stay",
 }
+_TURNS_BY_CURRENT = 255  # each way, of current-based position control (e-Manual XM430-W350, Goal Position)
 _LEDS = ("led", "led_red", "led_green", "led_blue")
 
 
@@ -173,7 +174,9 @@ class OneServo(OneNode):
         held = self.run_program(mode_switches.hold_servo(access_servo(self.plan, self._servo), mode))
         if held.problem:
             self.run_program(write_registers(self.access, [self.register("torque_enable", 0)], Findings()))
-            raise self.make_fault(f"{held.problem}; its torque is off")
+            offset = self.read_offset()
+            shifted = f"; Homing Offset = {offset} shifts its position" if offset else ""
+            raise self.make_fault(f"{held.problem}{shifted}; its torque is off")
         where = "" if held.goal is None else f" at its present tick {held.goal}"
         return f"holds torque in {mode.name.lower().replace('_', '-')} mode{where}"
 
@@ -209,18 +212,20 @@ class OneServo(OneNode):
         known."""
         for continuous in (False, True):
             try:
-                self.plan = self._plan(continuous)
+                self.plan = self._plan(turns=math.inf if continuous else 0)
             except ValueError:  # the model has no continuous mode
                 break
             mode = self.run_program(mode_switches.mode_now(access_servo(self.plan, self._servo)))
+            if mode is Mode.EFFORT_POSITION and "operating_mode" in self.table.items:
+                self.plan = self._plan(turns=_TURNS_BY_CURRENT)  # this mode counts turns as well
             if mode is not Mode.UNKNOWN:
                 return mode
         self.plan = self._plan()
         raise self.make_fault("is in an unknown mode; its torque stays off")
 
-    def _plan(self, continuous: bool = False) -> BusPlan:
+    def _plan(self, turns: float = 0) -> BusPlan:
         table, name = self.table, self.tool.port.name
-        end = math.inf if continuous else 0.0
+        end = turns * math.tau if turns else 0.0
         wiring = Wiring(
             joint=table.model,
             row=0,
@@ -230,7 +235,7 @@ class OneServo(OneNode):
             direction=1,
             lower=-end or table.min_tick * table.rad_per_tick,
             upper=end or table.max_tick * table.rad_per_tick,
-            continuous=continuous,
+            continuous=math.isinf(turns),
         )
         return bus_plan(
             name=name,
