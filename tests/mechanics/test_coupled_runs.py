@@ -7,6 +7,8 @@ import pytest
 from msgspec.structs import replace
 from tests.kit.line_faults import turn_by_hand
 from tests.kit.rigs import Events
+from tests.kit.sampled_run import SampledRun
+from tests.kit.stories import send
 from tests.kit.wire import all_writes
 
 from dxlrun.channels.answers import Completion, Refusal
@@ -30,6 +32,23 @@ from dxlrun_controllers.group import (
 pytestmark = pytest.mark.long
 
 TURN = 4096
+CROSSING = """\
+name: neck
+buses: {main: {port: sim, protocol: 2.0, baud_rate: 1_000_000, return_delay_time: 0 us}}
+loop: {rate: 50}
+joints:
+  pitch: {limits: {position: [-40 deg, 40 deg], velocity: 2 rad/s}}
+  roll: {limits: {position: [-60 deg, 60 deg], velocity: 2 rad/s}}
+transmissions:
+  neck_gear:
+    type: differential
+    joints: [pitch, roll]
+    servos:
+      left: {bus: main, id: 1, model: XM430-W350, reference: 10 deg, direction: 1}
+      right: {bus: main, id: 2, model: XM430-W350, reference: 350 deg, direction: -1}
+controllers: {neck: {type: joint_group_position_controller, joints: [pitch, roll]}}
+policies: {on_returned_servo: hold}
+"""
 
 
 @pytest.fixture
@@ -304,3 +323,32 @@ def test_torque_off_at_one_joint_of_a_wrist_takes_the_controllers_of_both(plan, 
     assert isinstance(robot.inbox.answers[1], Completion)
     active = read_log(tmp_path / "run.mcap").cycles["active"]  # bits: states, all, up, around
     assert (int(active[10]), int(active[-1])) == (0b1111, 0b0011)
+
+
+@pytest.mark.parametrize(("pitch", "roll"), [(0, 0), (38, -57), (-38, 58), (30, 50)])
+def test_servos_of_a_transmission_may_cross_raw_0(tmp_path, pitch, roll):
+    run = SampledRun(tmp_path, CROSSING, 4.0)
+    left, right = (run.bus.servo(number) for number in (1, 2))
+
+    def angles(pitch, roll):
+        return 10 + (pitch + roll), 350 - (pitch - roll)
+
+    def off(pitch, roll):
+        pairs = zip((left, right), angles(pitch, roll), strict=True)
+        return max(
+            abs(math.remainder(math.degrees(servo.shaft_angle) - angle, 360)) for servo, angle in pairs
+        )
+
+    for servo, angle in zip((left, right), angles(pitch, roll), strict=True):
+        turn_by_hand(servo, math.radians(angle))
+        servo.power_cycle()  # it forgets its turn
+    found = []
+    run.at(480, lambda: found.append(off(pitch, roll)))
+    run.ask(500, send("neck", "positions", 0.3, -0.7))
+    run.fault("brownout servo=1 at=2s for=200ms")
+    run.at(3900, lambda: found.append(off(math.degrees(0.3), math.degrees(-0.7))))
+    log = run.run()
+    assert max(found) < 1.5
+    assert found[0] < 0.1
+    assert log.cycles["position"][5] == pytest.approx([math.radians(pitch), math.radians(roll)], abs=0.002)
+    assert log.cycles["position"][-1] == pytest.approx([0.3, -0.7], abs=0.02)

@@ -438,6 +438,14 @@ def _fits(
         reach = servo.position_range
         if reach.contains(needed):
             continue
+        if None not in written and servo.counts_turns_for(needed):
+            file.warning(
+                file.key(*coupling.place),
+                f"servo {servo.described.title} (ID {servo.described.id}) crosses raw 0 of its "
+                f"{servo.table.model}, so it runs in extended position mode, which counts turns",
+                "turn its horn if the servo's own position limits shall apply, or ignore this",
+            )
+            continue
         upper = needed.upper - reach.upper > reach.lower - needed.lower
         end = needed.upper if upper else needed.lower
         corner = " and ".join(
@@ -447,11 +455,14 @@ def _fits(
         )
         joint = next(name for name, one in zip(coupling.joints, written, strict=True) if one is not None)
         lower, higher = sorted(theta(servo, each) for each in (reach.lower, reach.upper))
+        # A turned horn moves the travel, but does not make it longer.
+        is_long = needed.upper - needed.lower > reach.upper - reach.lower
+        horn = "" if is_long else "turn the servo's horn so that raw 0 is outside its travel, or "
         file.error(
             file.at("joints", joint, "limits", "position"),
             f"with {corner}, servo {servo.described.title} (ID {servo.described.id}) must be at "
             f"{degrees(theta(servo, end))} deg, but reaches {degrees(lower)} to {degrees(higher)} deg",
-            f"narrow the limits of {' and '.join(coupling.joints)}",
+            f"{horn}narrow the limits of {' and '.join(coupling.joints)}",
         )
         good = False
     return good
