@@ -208,6 +208,8 @@ class ServoPlan(msgspec.Struct, frozen=True):
     """Register values of the robot file that the start compares and does not write."""
     homing_offset: int | None = None
     """Homing Offset that reference and ticks contain; None: unknown before the start. See `placement`."""
+    unplaced_reference: float | None = None
+    """Reference of the robot file, if `reference` contains a Homing Offset; None: they are the same."""
     extended: bool = False
     """Position control counts turns, although the joint is not continuous; the start finds the turn."""
 

@@ -188,6 +188,20 @@ def test_another_servo_begins_anew_and_says_why(robot, tmp_path, change, why):
     assert run(robot, kept, **change) == 1, "its own state has taken the place"
 
 
+def test_declaring_the_offset_of_a_servo_keeps_its_state(tmp_path):
+    def states(key: str):
+        path = tmp_path / "robot.yaml"
+        path.write_text(
+            "name: arm\nbuses: {main: {port: sim, protocol: 2.0, baud_rate: 1_000_000}}\nloop: {rate: 50}\n"
+            "joints: {a: {bus: main, id: 1, model: XM430-W350, reference: 100.3 deg, direction: 1"
+            f"{key}, limits: {{position: [-50 deg, 50 deg]}}}}}}\n"
+        )
+        return read_states(plan_of(path), None)
+
+    assert states(", homing_offset: -300") == states("")
+    assert states(", homing_offset: -300").servos != {}
+
+
 def test_simulated_and_real_servos_do_not_share_a_state(robot, tmp_path):
     simulated, real = plan_of(robot), plan_of(robot, arguments={"port": "/dev/ttyUSB0"})
     home = Path(os.environ["XDG_STATE_HOME"]) / "dxlrun/keeper"

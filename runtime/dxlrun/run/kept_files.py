@@ -93,12 +93,14 @@ def _facts(plan: Plan, joint: JointPlan, bus: BusPlan, servo: ServoPlan) -> Fact
 
     Its firmware is only known after a read.
     """
+    # An offset that the robot file declares belongs to the servo's count, not to the joint.
+    reference = servo.reference if servo.unplaced_reference is None else servo.unplaced_reference
     facts = {
         "servo": "simulated" if is_simulated(bus.port) else "real",
         "model": servo.model,
         "ID": f"{servo.servo_id} on bus {bus.name}",
         "direction": str(servo.direction),
-        "reference": f"{servo.reference!r} rad",
+        "reference": f"{reference!r} rad",
     }
     if servo.ratio != 1.0:
         facts["ratio"] = repr(servo.ratio)

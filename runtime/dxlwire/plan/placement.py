@@ -26,7 +26,7 @@ OFFSET = "homing_offset"  # Control table item
 
 def place_servo(servo: ServoPlan, table: ControlTable, offset: int) -> ServoPlan:
     """Return the plan of a servo with this Homing Offset, ticks; the plan must not be placed yet."""
-    placed = replace(servo.moved(offset), homing_offset=offset)
+    placed = replace(servo.moved(offset), homing_offset=offset, unplaced_reference=servo.reference)
     if servo.continuous or servo.extended or (offset and not in_one_turn(placed, table)):
         return extend(placed, table)
     return placed
