@@ -274,7 +274,7 @@ def _servos(servos: Iterable[Row]) -> Table:
         (Column("goals, ticks", detail=True), lambda row: f"{row['lower_tick']}..{row['upper_tick']}"),
         (Column("goals, deg"), lambda row: f"{degrees(row['lower'])}..{degrees(row['upper'])}"),
     ]
-    return Table.listing("Servos (angles in deg from tick 0)", columns, servos)
+    return Table.listing("Servos (angles in deg from tick 0, as each servo reports them)", columns, servos)
 
 
 def _controllers(controllers: Sequence[Row], joints: int) -> Table:

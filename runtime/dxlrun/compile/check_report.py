@@ -139,6 +139,7 @@ def _servo(servo: CompiledServo, plan: ServoPlan) -> Row:
     return {
         "joint": described.title,
         **_described(described),
+        "reference": plan.reference,
         "ratio": described.ratio,
         "linear": described.unit is LINEAR,
         "lower_tick": plan.lower_tick,
