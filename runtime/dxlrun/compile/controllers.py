@@ -26,7 +26,7 @@ from dxlrun.compile.joints.described_servos import used_features
 from dxlrun.compile.joints.limits import report_speed
 from dxlrun.compile.joints.register_values import UnfitRegister
 from dxlrun.compile.problems import RobotFile, into_mark, joint_mark
-from dxlrun.contract.controller import SpeedPeak
+from dxlrun.contract.controller import NOT_BY_JOINT, SpeedPeak
 from dxlrun.control.controllers.claims import claimed_modes, start_modes
 from dxlrun.control.controllers.plugin_loading import Offer, PlugIns
 from dxlrun.control.controllers.single_files import file_of, is_of_file
@@ -128,6 +128,7 @@ def _compiled(
     offer = _offer(file, name, plan.type, plugins)
     if offer is None:
         return None
+    _refuse_uneven(file, name, offer.controller.Parameters)
     wrapping = {joint for joint, described in robot.joints.items() if described.wrap}
 
     def make_compiled() -> CompiledController:
@@ -141,6 +142,19 @@ def _compiled(
         mark = file.key("controllers", name)
         file.error(mark, f"{min(taken)} is the topic of a bus", f"rename controller {name}")
     return found
+
+
+def _refuse_uneven(file: RobotFile, name: str, model: type[ParametersModel]) -> None:
+    """Add an error for each list of a controller that may still have values for joints that are omitted."""
+    for _, of, *keys in file.description.uneven:
+        field = model.model_fields.get(str(keys[0]))
+        if of != name or (field is not None and NOT_BY_JOINT in field.metadata):
+            continue
+        what = (
+            f"{keys[-1]} of {name} is as long as its list joints was, so it may have values of omitted joints"
+        )
+        fix = "write it as a mapping by joint, or let its class declare NOT_BY_JOINT"
+        file.error(file.key("controllers", name, *keys), what, fix)
 
 
 def report_entry(  # noqa: PLR0917  an entry, and what is made of it

@@ -40,6 +40,17 @@ class Live(msgspec.Struct, frozen=True):
 LIVE: Final = Live()
 
 
+class NotByJoint(msgspec.Struct, frozen=True):
+    """Marker of a list whose values do not belong to joints: `Annotated[list[float], NOT_BY_JOINT]`.
+
+    A run that omits joints refuses other lists that are as long as `joints` is: values of the wrong joints
+    would move them. Values for joints are a mapping by joint, which such a run shortens.
+    """
+
+
+NOT_BY_JOINT: Final = NotByJoint()
+
+
 class RegisterChange(msgspec.Struct, frozen=True):
     """Value that a controller may write into a register of a joint's servos during a run."""
 

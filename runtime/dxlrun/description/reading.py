@@ -34,6 +34,8 @@ class Description(msgspec.Struct, frozen=True):
     """Joints that are omitted, then groups that have no other joint; `robot` is without them."""
     remarks: tuple[Problem, ...] = ()
     """Warnings of reading, such as what is omitted together with a joint."""
+    uneven: tuple[KeyPath, ...] = ()
+    """Lists of controllers that may have a value for a joint that is omitted."""
 
     @property
     def groups(self) -> dict[str, tuple[str, ...]]:
@@ -96,7 +98,15 @@ def _read_robot(
         raise InputError(_in_order(told_once(error.problems, joints))) from None
     included = {str(source.path): source.text for source in sources[:-1]}
     return Description(
-        robot, grown.marks, path, sources[-1].text, run.texts, included, omitted.names, omitted.remarks
+        robot,
+        grown.marks,
+        path,
+        sources[-1].text,
+        run.texts,
+        included,
+        omitted.names,
+        omitted.remarks,
+        omitted.uneven,
     )
 
 

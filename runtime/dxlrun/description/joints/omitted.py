@@ -40,6 +40,8 @@ class Omission(msgspec.Struct, frozen=True):
     """Joints that are omitted, then groups that have no other joint."""
     remarks: tuple[Problem, ...] = ()
     """A warning that names the joints, what is omitted with them, and what continues without them."""
+    uneven: tuple[KeyPath, ...] = ()
+    """Lists of controllers that may have one value for each joint, also for those omitted."""
 
 
 def omit_joints(grown: PlainDocument, without: Sequence[str]) -> Omission:
@@ -79,7 +81,8 @@ def omit_joints(grown: PlainDocument, without: Sequence[str]) -> Omission:
     return Omission(
         replace(reduced, problems=problems),
         (*out, *(name for name in groups if name not in left)),
-        (remark, *_uneven(grown, reduced, remover.uneven)),
+        (remark,),
+        tuple(at for at in remover.uneven if str(at[1]) in _mapping(reduced.data.get(_CONTROLLERS))),
     )
 
 
@@ -155,7 +158,7 @@ class _Remover:
         by_joint = self._is_by_joint(value, path)
         if path[:1] == (_CONTROLLERS,) and self._out.intersection(joints := _list(value.get("joints"))):
             self.uneven += [
-                (*path, key)
+                (*place, key)
                 for key, item in value.items()
                 if isinstance(item, list) and len(item) == len(joints) and key not in (*_LISTS, *_OTHERS)
             ]
@@ -255,15 +258,6 @@ def _missed(grown: PlainDocument, reduced: PlainDocument) -> Iterator[Problem]:
                     mark = grown.marks.value(_CONTROLLERS, name, key)
                     what = f"{key} of {name} names {other}, which is omitted with its joints"
                     yield Problem(mark, what, "name another controller")
-
-
-def _uneven(grown: PlainDocument, reduced: PlainDocument, lists: Sequence[KeyPath]) -> Iterator[Problem]:
-    """Yield a warning for each list that may have one value for each joint, also for those omitted."""
-    for _, name, *rest in lists:
-        if name in _mapping(reduced.data.get(_CONTROLLERS)):
-            what = f"{rest[-1]} of {name} is as long as its list joints was, and is not shortened"
-            fix = "if it has a value for each joint, write it as a mapping by joint"
-            yield Problem(grown.marks.key(_CONTROLLERS, name, *rest), what, fix, severity="warning")
 
 
 def _is_emptied(item: object, kept: object) -> bool:
