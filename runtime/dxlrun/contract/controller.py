@@ -44,7 +44,7 @@ class NotByJoint(msgspec.Struct, frozen=True):
     """Marker of a list whose values do not belong to joints: `Annotated[list[float], NOT_BY_JOINT]`.
 
     A run that omits joints refuses other lists that are as long as `joints` is: values of the wrong joints
-    would move them. Values for joints are a mapping by joint, which such a run shortens.
+    would move them. A mapping by joint is shortened.
     """
 
 
