@@ -37,6 +37,7 @@ SOURCES = tuple(
     for path in (
         ("dxlwire", "exchange", "kernel.c"),
         ("dxlrun", "control", "gate.c"),
+        ("dxlsim", "wire", "line.c"),
         ("dxlrun", "channels", "shared_memory.c"),
         ("dxlsim", "motion", "mechanics.c"),
     )

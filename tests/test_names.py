@@ -39,6 +39,7 @@ SHARED_METHODS = {
     "add_slice": "protocol `Collector` of the analysis",
     "perform_on": "members of the union `Action` of the view",
     "words": "requests to the loop, each as text for its event",
+    "now_ns": "protocol `Clock`, and the time of a record",
 }
 SHARED_CLASSES = {
     "Switch": "advertised by the service for viewers, and in the description of the HTTP interface",

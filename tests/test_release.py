@@ -39,6 +39,7 @@ OBJECTS = {
     },
     "dxlrun/control/libgate.so": {"gate_apply", "dxl_source"},
     "dxlsim/motion/libmechanics.so": {"motion_step_to", "dxl_source"},
+    "dxlsim/wire/libline.so": {"line_receive", "line_drain", "dxl_source"},
     "dxlwire/exchange/libkernel.so": {
         "dxl_read",
         "dxl_write",

@@ -82,7 +82,7 @@ class Values(dict[str, Any]):
             "faults": lambda: self.line.faults,
             "fault_times": lambda: [e.t_ns / 1e9 for e in self.line.ledger.entries if "fault: " in e.note],
             "address_of": lambda: lambda item: self.line.item(item).address,
-            "memory": lambda: servo.registers.read_bytes(0, servo.registers.size - 30),
+            "memory": lambda: bytes(servo.registers.image)[:-30],
         }
         return known[name]() if name in known else self.line.get(name)
 

@@ -9,10 +9,12 @@ import fnmatch
 from collections.abc import Iterator
 
 import pytest
+from tests.kit.packets import packet1, packet2
+from tests.kit.simulated_line import split_statuses
 
-from dxlsim.servo.making import make_servo
-from dxlsim.simulation_plan import ServoConfig
-from dxlsim.wire.servo_packets import InstructionPacket
+from dxlsim.bus.ledger import Ledger
+from dxlsim.bus.simulated_bus import SimulatedBus
+from dxlsim.simulation_plan import BusConfig, ServoConfig
 from dxlwire.control_table import ControlItem, ControlTable, all_tables
 
 OLD = [table for table in all_tables() if table.protocol == 1.0]
@@ -69,7 +71,9 @@ class Desk:
     def __init__(self, table: ControlTable) -> None:
         self.table = table
         rate = next(iter(table.baud_rates.values()))
-        self.servo = make_servo(ServoConfig(1, table.model, 0.3), rate, 0, protocol=table.protocol)
+        config = BusConfig("main", rate, (ServoConfig(1, table.model, 0.3),), table.protocol)
+        self.bus = SimulatedBus(config, Ledger(keep=False), 0)
+        self.servo = self.bus.servos[0]
         self.registers = self.servo.registers
         self.open_limits()
 
@@ -85,9 +89,10 @@ class Desk:
         """Return the error, without the bits of the state, and the data of the answer."""
         width = 2 if self.table.protocol == 2.0 else 1
         words = b"".join(number.to_bytes(width, "little") for number in numbers)
-        reply = self.servo.execute_packet(InstructionPacket(1, instruction, words + data, True, 0), 0)
-        assert reply is not None
-        return reply.error & ~STATE[self.table.protocol], reply.parameters
+        made = packet2(1, instruction, words + data) if width == 2 else packet1(1, instruction, *words, *data)
+        self.bus.receive_bytes(made, self.bus.host_free_ns)
+        (answer,) = split_statuses(self.bus.drain_bytes(self.bus.next_due_ns()), self.table.protocol)
+        return answer.error & ~STATE[self.table.protocol], answer.parameters
 
     def write(self, item: ControlItem, value: int | bytes) -> int:
         data = value if isinstance(value, bytes) else wire(item, value)

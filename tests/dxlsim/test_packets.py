@@ -8,24 +8,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.kit.packets import packet1, packet2
+from tests.kit.simulated_line import Line
 
-from dxlsim.wire import servo_protocol1, servo_protocol2
-from dxlsim.wire.servo_packets import (
-    BROADCAST,
-    GroupRead,
-    InstructionPacket,
-    InstructionReceiver,
-    ReadEntry,
-    ServoReply,
-)
-from dxlsim.wire.servo_protocol2 import FastStatusPacket, crc16, stuffed, unstuffed
+from dxlsim.wire import servo_protocol1
+from dxlsim.wire.compiled_line import InstructionReceiver, crc16, group_read, status_packet
+from dxlsim.wire.servo_packets import BROADCAST, GroupRead, InstructionPacket, ReadEntry
 
-ONE, TWO = servo_protocol1.CODEC, servo_protocol2.CODEC
+ONE, TWO = 1.0, 2.0
+HEADERS = {ONE: bytes.fromhex("ffff"), TWO: bytes.fromhex("fffffd00")}
 MANY = settings(max_examples=100, deadline=None)
 BODIES = st.lists(st.sampled_from([0xFF, 0xFF, 0xFD, 0x00, 0x55]) | st.integers(0, 255), min_size=1).map(
     bytes
 )
-both = pytest.mark.parametrize("codec", [ONE, TWO], ids=["1.0", "2.0"])
+both = pytest.mark.parametrize("protocol", [ONE, TWO])
 
 
 def found_in(receiver: InstructionReceiver, data: bytes) -> Iterator[InstructionPacket]:
@@ -37,19 +32,19 @@ def found_in(receiver: InstructionReceiver, data: bytes) -> Iterator[Instruction
 
 
 @pytest.mark.parametrize(
-    ("codec", "text"),
+    ("protocol", "text"),
     [(ONE, "ff ff 01 04 02 2b 01 cc"), (TWO, "fffffd0001 0700 02 84000400 1d15")],
     ids=["1.0", "2.0"],
 )
-def test_one_wrong_bit_behind_the_header_never_goes_unseen(codec, text):
-    for index in range(len(codec.header), len(bytes.fromhex(text))):
+def test_one_wrong_bit_behind_the_header_never_goes_unseen(protocol, text):
+    for index in range(len(HEADERS[protocol]), len(bytes.fromhex(text))):
         data = bytearray.fromhex(text)
         data[index] ^= 0x10
-        assert not any(packet.intact for packet in found_in(InstructionReceiver(codec), bytes(data)))
+        assert not any(packet.intact for packet in found_in(InstructionReceiver(protocol), bytes(data)))
 
 
 @pytest.mark.parametrize(
-    ("codec", "text"),
+    ("protocol", "text"),
     [
         (ONE, "ff ff ff 01 02 01 fb"),  # a third ff belongs to the header of the next packet
         (ONE, "ff ff 01 01 ff ff 01 02 01 fb"),  # a length below two is noise
@@ -57,8 +52,8 @@ def test_one_wrong_bit_behind_the_header_never_goes_unseen(codec, text):
         (TWO, "fffffd00 ff 0300 fffffd00 01 0300 01 194e"),
     ],
 )
-def test_what_cannot_be_a_packet_hides_none(codec, text):
-    (packet,) = found_in(InstructionReceiver(codec), bytes.fromhex(text))
+def test_what_cannot_be_a_packet_hides_none(protocol, text):
+    (packet,) = found_in(InstructionReceiver(protocol), bytes.fromhex(text))
     assert (packet.servo_id, packet.instruction, packet.intact) == (1, 0x01, True)
 
 
@@ -77,12 +72,12 @@ def test_what_cannot_be_a_packet_hides_none(codec, text):
     ),
     st.lists(st.integers(1, 20), min_size=1, max_size=20),
 )
-def test_every_packet_between_noise_is_found_once_however_it_is_cut(codec, packets, cuts):
+def test_every_packet_between_noise_is_found_once_however_it_is_cut(protocol, packets, cuts):
     line = b""
     for noise, servo_id, instruction, parameters in packets:
         made = packet1(servo_id, instruction, *parameters), packet2(servo_id, instruction, parameters)
-        line += noise + made[codec is TWO]
-    receiver, found, at = InstructionReceiver(codec), [], 0
+        line += noise + made[protocol == TWO]
+    receiver, found, at = InstructionReceiver(protocol), [], 0
     while at < len(line):
         piece = line[at : at + cuts[at % len(cuts)]]
         at += len(piece)
@@ -95,39 +90,45 @@ def test_every_packet_between_noise_is_found_once_however_it_is_cut(codec, packe
 @both
 @MANY
 @given(st.binary(max_size=400), st.lists(st.integers(1, 60), min_size=1))
-def test_how_any_bytes_are_cut_makes_no_difference(codec, data, sizes):
-    data = data.replace(b"\x80", codec.header)  # headers are rare in random bytes
-    whole = [(each.parameters, each.intact) for each in found_in(InstructionReceiver(codec), data)]
-    receiver, pieces, at = InstructionReceiver(codec), [], 0
+def test_how_any_bytes_are_cut_makes_no_difference(protocol, data, sizes):
+    data = data.replace(b"\x80", HEADERS[protocol])  # headers are rare in random bytes
+    whole = [(each.parameters, each.intact) for each in found_in(InstructionReceiver(protocol), data)]
+    receiver, pieces, at = InstructionReceiver(protocol), [], 0
     while at < len(data):
         size = sizes[at % len(sizes)]
         pieces += found_in(receiver, data[at : at + size])
         at += size
-        assert codec is TWO or receiver.pending <= servo_protocol1.LONGEST
+        assert protocol == TWO or receiver.pending <= servo_protocol1.LONGEST
     assert [(each.parameters, each.intact) for each in pieces] == whole
 
 
 @MANY
 @given(BODIES)
 def test_stuffing_hides_every_header_and_comes_off_again(body):
-    assert unstuffed(stuffed(body)) == body
-    assert b"\xff\xff\xfd\x00" not in stuffed(body)
+    made = status_packet(TWO, 1, 0, body)
+    assert b"\xff\xff\xfd\x00" not in made[4:]
+    packet = InstructionReceiver(TWO).feed_bytes(made)  # a status packet has the error after its instruction
+    assert (packet.intact, packet.instruction, packet.parameters) == (True, 0x55, b"\0" + body)
 
 
 def test_crc_and_stuffing_are_those_of_the_catalogue_and_the_manual():
     assert crc16(b"123456789") == 0xFEE8  # CRC-16/UMTS
     examples = ("fffffd", "fffffdfd"), ("03fffffdfd00", "03fffffdfdfd00"), ("fffffffffd", "fffffffffdfd")
     for plain, hidden in examples:
-        assert stuffed(bytes.fromhex(plain)) == bytes.fromhex(hidden)
+        assert status_packet(TWO, 1, 0, bytes.fromhex(plain))[9:-2] == bytes.fromhex(hidden)
 
 
 def test_data_of_a_fast_status_are_not_stuffed():
-    part = FastStatusPacket((4,)).part(ServoReply(1, 0, bytes.fromhex("fffffd00"), 0))
-    assert part[8:14] == bytes.fromhex("0001 fffffd00")
+    line = Line("XL430-W250", 1)
+    for number, byte in enumerate(bytes.fromhex("fffffd00"), 1):
+        line.servo().poke(f"indirect_data_{number}", byte)
+    address = line.item("indirect_data_1").address
+    line.instruct(BROADCAST, 0x8A, line.word(address) + line.word(4) + b"\x01")
+    assert line.receive()[8:14] == bytes.fromhex("0001 fffffd00")
 
 
 @pytest.mark.parametrize(
-    ("codec", "instruction", "parameters", "entries"),
+    ("protocol", "instruction", "parameters", "entries"),
     [
         (ONE, 0x92, "00 02 01 1e 02 02 24", [(1, 0x1E, 2), (2, 0x24, 2)]),
         (TWO, 0x82, "84000400 0102", [(1, 132, 4), (2, 132, 4)]),
@@ -143,11 +144,10 @@ def test_data_of_a_fast_status_are_not_stuffed():
         (TWO, 0x02, "84000400", None),
     ],
 )
-def test_reads_in_turn_are_understood(codec, instruction, parameters, entries):
+def test_reads_in_turn_are_understood(protocol, instruction, parameters, entries):
     packet = InstructionPacket(BROADCAST, instruction, bytes.fromhex(parameters), intact=True, end=0)
-    together = instruction in (0x8A, 0x9A)
     listed = tuple(ReadEntry(*each) for each in entries or ())
-    read = GroupRead(instruction, listed, fast=together, has_slots=codec is TWO and not together)
-    assert codec.group_read(packet) == (read if entries else None)
-    assert codec.group_read(packet._replace(servo_id=1)) is None
-    assert codec.group_read(packet._replace(intact=False)) is None
+    read = GroupRead(instruction, listed, fast=instruction in (0x8A, 0x9A))
+    assert group_read(protocol, packet) == (read if entries else None)
+    assert group_read(protocol, packet._replace(servo_id=1)) is None
+    assert group_read(protocol, packet._replace(intact=False)) is None

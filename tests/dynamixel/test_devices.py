@@ -163,7 +163,7 @@ def test_a_lost_device_costs_the_servos_nothing(fast, capabilities):
 @pytest.mark.parametrize("fast", [True, False])
 def test_a_device_that_answers_only_alone_is_read_alone(monkeypatch, fast):
     rig = started(("speed",), ("speed",), fast=fast)
-    monkeypatch.setattr(device(rig), "_takes_part", lambda read: False)
+    device(rig).line.group_reads = 0
     for cycle in range(30):
         poke(rig, "profile_velocity", cycle)
         cycle_valid(rig)
@@ -178,11 +178,10 @@ def test_a_device_that_answers_only_alone_is_read_alone(monkeypatch, fast):
 def test_a_device_that_answers_only_between_the_cycles_is_asked_seldom(monkeypatch):
     rig = started(("speed",), capabilities=NONE)
     rig.hardware._kernel.plan = lambda *_: False  # the parser shows when it reads
-    execute = device(rig).execute_packet
+    receives = device(rig).receives
     reads = rig.hardware._servos[0].reads
-    monkeypatch.setattr(
-        device(rig), "execute_packet", lambda *given: None if reads.begun else execute(*given)
-    )
+    device(rig).line.asks = 1
+    monkeypatch.setattr(device(rig), "receives", lambda now_ns: not reads.begun and receives(now_ns))
     cycle_valid(rig, 120)
     (lost, *_) = rig.events.of(EventCode.DEVICE_LOST)
     assert "answers single reads, but not those of the cycles" in lost[1]

@@ -356,6 +356,7 @@ def test_a_wheel_has_every_object_that_is_compiled(build, tmp_path):
     rooms = (
         "dxlwire/exchange/libkernel.so",
         "dxlrun/control/libgate.so",
+        "dxlsim/wire/libline.so",
         "dxlrun/channels/libshared_memory.so",
         "dxlsim/motion/libmechanics.so",
     )

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Mapping
 
-from dxlsim.bus.simulated_bus import PacketFault, SimulatedBus
-from dxlsim.bus.simulated_line import LineTransmission, flipped
+from dxlsim.bus.simulated_bus import DisturbedReply, PacketFault, SimulatedBus
+from dxlsim.faults.kinds import flipped
 from dxlsim.servo.simulated_servo import SimulatedServo
-from dxlsim.wire.servo_packets import InstructionReceiver
+from dxlsim.wire.compiled_line import Task, packet_of
+from dxlsim.wire.servo_packets import InstructionPacket
 
 STALLED = "the adapter stalls"
 OTHER_HOST = "another host sends"  # How the note of an instruction of another host begins
@@ -35,24 +35,59 @@ def disturb_replies(bus: SimulatedBus, servo_id: int, faults: Mapping[int, Packe
 
     A fault whose text is STALLED delays the replies after it, too: they keep their order.
     """
-    send, count, stalled_until_ns = bus._send_reply, 0, 0
+    count, stalled_until_ns = 0, 0
 
-    def send_disturbed(replying: int, reply: LineTransmission) -> bool:
+    def next_fault(reply: DisturbedReply) -> PacketFault | None:
         nonlocal count, stalled_until_ns
-        if replying == servo_id:
-            fault = faults.get(count)
-            if fault is not None and fault.text == STALLED:
-                stalled_until_ns = max(stalled_until_ns, reply.first_ns + fault.delay_ns)
-            if reply.first_ns < stalled_until_ns:
-                fault = PacketFault(STALLED, bytes, stalled_until_ns - reply.first_ns)
-                stalled_until_ns += reply.due_ns - reply.first_ns
-            if fault is not None:
-                bus._reply_faults.setdefault(servo_id, deque()).append(fault)
-            count += 1
-        return send(replying, reply)
+        fault = faults.get(count)
+        if fault is not None and fault.text == STALLED:
+            stalled_until_ns = max(stalled_until_ns, reply.first_ns + fault.delay_ns)
+        if reply.first_ns < stalled_until_ns:
+            fault = PacketFault(STALLED, bytes, stalled_until_ns - reply.first_ns)
+            stalled_until_ns += reply.due_ns - reply.first_ns
+        count += 1
+        return fault
 
-    bus._send_reply = send_disturbed  # type: ignore[method-assign]
+    _choose_faults(bus, servo_id, next_fault)
     return lambda: count
+
+
+def change_replies(bus: SimulatedBus, choose: Callable[[int, DisturbedReply], PacketFault | None]) -> None:
+    """Ask for a fault of each reply from now on, unless one is planned; `choose` gets ID and reply."""
+    fault_of = bus._fault_of
+
+    def chosen(servo_id: int, reply: DisturbedReply) -> PacketFault | None:
+        planned = fault_of(servo_id, reply)
+        bus._line.disturbed[servo_id] = 1
+        return choose(servo_id, reply) if planned is None else planned
+
+    bus._fault_of = chosen  # type: ignore[method-assign]
+    for servo in bus.servos:
+        bus._line.disturbed[servo.servo_id] = 1
+
+
+def _choose_faults(
+    bus: SimulatedBus, servo_id: int, choose: Callable[[DisturbedReply], PacketFault | None]
+) -> None:
+    """Ask for a fault of each reply of a servo from now on."""
+    change_replies(bus, lambda replying, reply: choose(reply) if replying == servo_id else None)
+
+
+def watch_instructions(bus: SimulatedBus, watch: Callable[[InstructionPacket, int], None]) -> None:
+    """Call `watch` with each instruction from now on, and the time of its end, before servos execute it."""
+    alter = bus._tasks[Task.ALTER]
+
+    def watched(*given: int) -> None:
+        packet, end_ns = packet_of(bus._line.packet), bus._line.end_ns
+        watch(packet, end_ns)
+        if bus._instruction_faults or alter != bus._alter:
+            alter(*given)
+        else:
+            bus._library.line_execute_altered(bus.address, packet.raw, len(packet.raw))
+        bus._line.altered = 1
+
+    bus._tasks[Task.ALTER] = watched
+    bus._line.altered = 1
 
 
 def other_host(bus: SimulatedBus, packet: bytes, at_ns: int, *, received: bool = True) -> None:
@@ -63,14 +98,12 @@ def other_host(bus: SimulatedBus, packet: bytes, at_ns: int, *, received: bool =
     """
 
     def send() -> None:
-        bus._withdraw_waiting()
+        bus.withdraw_waiting()
         bus.add_note(f"{OTHER_HOST} {packet.hex(' ')}")
-        start_ns, end_ns = bus.now_ns, bus.now_ns + bus._line.duration_ns(len(packet))
+        end_ns = bus.now_ns + bus.duration_ns(len(packet))
         if received:
-            bus._line.send(LineTransmission(start_ns, end_ns, packet, "another host"))
-        instruction = InstructionReceiver(bus._codec).feed_bytes(packet, 0)
-        if instruction is not None:
-            bus._execute(instruction, end_ns)
+            bus.send_bytes(packet, bus.now_ns, "another host")
+        bus.execute_bytes(packet, end_ns)
 
     bus.at(at_ns, send)
 
@@ -85,11 +118,9 @@ def turn_by_hand(servo: SimulatedServo, angle: float) -> None:
 
 def lose_replies(bus: SimulatedBus, servo_id: int, begin_ns: int, end_ns: int) -> None:
     """Lose every reply of a servo that would begin in a time; the servo still executes its instructions."""
-    send = bus._send_reply
 
-    def send_or_lose(replying: int, reply: LineTransmission) -> bool:
-        if replying == servo_id and begin_ns <= reply.first_ns < end_ns:
-            truncate_next(bus, servo_id, 0)
-        return send(replying, reply)
+    def lost(reply: DisturbedReply) -> PacketFault | None:
+        outside = not begin_ns <= reply.first_ns < end_ns
+        return None if outside else PacketFault("its reply cut to 0 bytes", lambda _: b"")
 
-    bus._send_reply = send_or_lose  # type: ignore[method-assign]
+    _choose_faults(bus, servo_id, lost)

@@ -14,6 +14,7 @@ SOURCES = tuple(
         "dxlrun/channels/shared_memory.c",
         "dxlrun/control/gate.c",
         "dxlsim/motion/mechanics.c",
+        "dxlsim/wire/line.c",
         "dxlwire/exchange/kernel.c",
     )
 )

@@ -4,12 +4,15 @@ runtime cannot edit it."""
 from __future__ import annotations
 
 import contextlib
+import struct
 from collections.abc import Callable
+from ctypes import byref, string_at
 from pathlib import Path
 from typing import IO, Annotated, Literal, NamedTuple
 
 import msgspec
 
+from dxlsim.wire.compiled_line import line_library, new_ledger
 from dxlwire.exceptions import InputError
 
 Direction = Literal["in", "out", "note"]
@@ -47,6 +50,13 @@ class _Line(msgspec.Struct, omit_defaults=True):
     late_ns: _Time = 0
 
 
+_RECORD = struct.Struct("<3q4i")
+"""Head of an entry in the line's ledger, before note and data: time, lateness, size of the data; bus,
+direction, size of the note, unused."""
+_MOST_HELD = 1 << 18  # Bytes that the line holds while a file is written
+_DIRECTIONS: tuple[Direction, Direction] = ("in", "out")  # In the order of line.c
+
+
 _encoder, _decoder = msgspec.json.Encoder(), msgspec.json.Decoder(_Line)
 
 
@@ -61,12 +71,46 @@ class Ledger:
     """
 
     def __init__(self, file: IO[bytes] | None = None, *, keep: bool = True) -> None:
-        self.entries: list[LedgerEntry] = []
+        self._entries: list[LedgerEntry] = []
         self.error: str | None = None  # Reason why the file is incomplete; None: it is complete
         self.on_note: Callable[[str], None] | None = None  # Called with each note
         self._keep = keep
         self._file = file
         self._unflushed_ns: int | None = None
+        self._buses: list[str] = []
+        self.state = new_ledger(self)
+        """State that the lines use: the entries that they have added, and how many they may hold."""
+        self.state.on = keep or file is not None
+        self.state.most = 0 if file is None else _MOST_HELD
+
+    @property
+    def entries(self) -> list[LedgerEntry]:
+        """The entries in memory."""
+        self.take_entries()
+        return self._entries
+
+    def add_bus(self, name: str) -> int:
+        """Return the number under which the line of a bus adds entries."""
+        self._buses.append(name)
+        return len(self._buses) - 1
+
+    def take_entries(self) -> None:
+        """Take the entries that the lines have added since the last call."""
+        held = self.state.entries
+        if not held.size:
+            return
+        data, at = string_at(held.data, held.size), 0
+        line_library().line_forget(byref(self.state))
+        while at < len(data):
+            t_ns, late_ns, size, bus, direction, noted, _ = _RECORD.unpack_from(data, at)
+            at += _RECORD.size
+            note = data[at : at + noted].decode()
+            at += noted + size
+            self._append(
+                LedgerEntry(
+                    t_ns, self._buses[bus], _DIRECTIONS[direction], data[at - size : at], note, late_ns
+                )
+            )
 
     def add(
         self,
@@ -79,22 +123,28 @@ class Ledger:
         late_ns: int = 0,
     ) -> None:
         """Add an entry with bytes or a note. `flush_if_due` or `close` makes sure that it is in the file."""
+        self.take_entries()
+        self._append(LedgerEntry(t_ns, bus, direction, data, note, late_ns))
+        if direction == "note" and self.on_note is not None:
+            self.on_note(note)
+
+    def _append(self, entry: LedgerEntry) -> None:
         if self._keep:
-            self.entries.append(LedgerEntry(t_ns, bus, direction, data, note, late_ns))
+            self._entries.append(entry)
         if self._file is not None:
             if self._unflushed_ns is None:
-                self._unflushed_ns = t_ns
+                self._unflushed_ns = entry.t_ns
             try:
-                line = _Line(t_ns, bus, direction, data.hex(), note, late_ns)
+                line = _Line(*entry[:3], entry.data.hex(), entry.note, entry.late_ns)
                 self._file.write(_encoder.encode(line) + b"\n")
             except OSError as error:
                 self._give_up(error)
-        if direction == "note" and self.on_note is not None:
-            self.on_note(note)
 
     def flush_due_ns(self) -> int | None:
         """Return the time by which the file must be flushed, ns on the clock of the entries; None if
         nothing is unwritten."""
+        if self._file is not None:
+            self.take_entries()
         return None if self._unflushed_ns is None else self._unflushed_ns + FLUSH_NS
 
     def flush_if_due(self, now_ns: int) -> None:
@@ -105,6 +155,7 @@ class Ledger:
 
     def flush(self) -> None:
         """Write all entries that are buffered to the file."""
+        self.take_entries()
         self._unflushed_ns = None
         if self._file is not None:
             try:

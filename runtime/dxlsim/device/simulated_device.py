@@ -7,18 +7,26 @@ EEPROM is never locked."""
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from random import Random
 from types import MappingProxyType
 
 from msgspec.structs import replace
 
 from dxlsim.device.device_quantities import DeviceQuantities, make_readers
-from dxlsim.registers.access import ACCESS, device_error
+from dxlsim.registers.access import device_error
 from dxlsim.registers.memory import Memory
-from dxlsim.servo.node import Answer, SimulatedNode, baud_value
+from dxlsim.servo.node import (
+    BULK_READ,
+    FAST_BULK_READ,
+    FAST_SYNC_READ,
+    SYNC_READ,
+    Answer,
+    SimulatedNode,
+    baud_value,
+)
 from dxlsim.simulation_plan import DeviceConfig
-from dxlsim.wire.servo_packets import GroupRead, Instruction, InstructionPacket
+from dxlsim.wire.servo_packets import Instruction, InstructionPacket
 from dxlwire.control_table import ControlItem, ControlTable
 from dxlwire.control_table.device_models import device_table
 from dxlwire.control_table.device_table import WAITS, DeviceTable, read_device_table
@@ -30,8 +38,8 @@ BOOT_NS = 100_000_000  # Time without reception after a reboot [i]
 
 
 class SimulatedDevice(SimulatedNode):
-    """One simulated device. The bus calls `execute` and `reply_to_group_read`; faults and tests call the
-    rest."""
+    """One simulated device. The line calls `receives`, `present`, `execute_packet`, `chain` and `overhear`;
+    faults and tests call the rest."""
 
     kind = "device"
 
@@ -65,12 +73,14 @@ class SimulatedDevice(SimulatedNode):
             memory["return_delay_time"] = min(254, round(config.return_delay_ns / 2000))
         if "baud_rate" in memory:
             memory["baud_rate"] = baud_value(registers, baud_rate)
-        memory.watch_items(ACCESS.identity, self._identify)
+        self._watch_identity()
+        self.line.asks = 1
+        fast = self.can("fast_sync_read")
+        self.line.group_reads = (SYNC_READ | (fast and FAST_SYNC_READ) if self.can("sync_read") else 0) | (
+            BULK_READ | (fast and FAST_BULK_READ) if self.can("bulk_read") else 0
+        )
 
-    def _identify(self) -> None:
-        self.servo_id = self.registers["id"]
-
-    # Interface to the bus
+    # Interface to the line
 
     @property
     def baud_rate(self) -> int:
@@ -82,10 +92,8 @@ class SimulatedDevice(SimulatedNode):
         self.now_ns = max(self.now_ns, now_ns)
 
     def receives(self, now_ns: int) -> bool:
-        """Return True if the device receives an instruction that ends at `now_ns`: it is not silent,
-        booting, waiting or disconnected."""
-        if self._silent or now_ns < self._deaf_until_ns:
-            return False
+        """Return True if the device receives an instruction that ends at `now_ns`: it is neither waiting nor
+        disconnected."""
         if self._awaited_id is not None and now_ns < self._waits_until_ns:
             self.note(f"{self.called}: ignores instructions until {self._awaited_id} has replied")
             return False
@@ -93,12 +101,22 @@ class SimulatedDevice(SimulatedNode):
         self.advance_to(now_ns)
         return all(contact() for contact in self._contacts)
 
-    def chain(self, read: GroupRead, now_ns: int) -> None:
-        """Start to wait for the status before the device's own in a group read, if its board has this
-        behaviour."""
-        listed = [entry.servo_id for entry in read.entries]
-        place = listed.index(self.servo_id) if self.can(WAITS) and self.servo_id in listed else 0
-        if place and self.receives(now_ns):
+    def present(self, now_ns: int, address: int, length: int) -> None:
+        """Set the registers of a range to their present values."""
+        if length:
+            self.registers.refresh_range(address, length)
+
+    @property
+    def waits(self) -> bool:
+        """True if the device's board waits for the status before its own in a group read."""
+        return self.can(WAITS)
+
+    def chain(self, listed: Sequence[int], now_ns: int) -> None:
+        """Start to wait for the status before the device's own in a group read of these IDs, if its board
+        has this behaviour."""
+        place = listed.index(self.servo_id) if self.waits and self.servo_id in listed else 0
+        hears = not self.is_silent and now_ns >= self.line.deaf_until_ns
+        if place and hears and self.receives(now_ns):
             self._awaited_id, self._waits_until_ns = listed[place - 1], now_ns + CHAIN_WAIT_NS
 
     def overhear(self, servo_id: int, now_ns: int) -> None:
@@ -123,11 +141,14 @@ class SimulatedDevice(SimulatedNode):
         known = (Instruction.PING, Instruction.READ, Instruction.WRITE)
         return instruction in known or (instruction in needs and self.can(needs[Instruction(instruction)]))
 
-    def _replies_to(self, packet: InstructionPacket, own: bool) -> bool:
-        """Return True if the device answers an instruction. Of the broadcasts only a ping is answered, if
+    def execute_packet(self, packet: InstructionPacket, now_ns: int) -> Answer | None:
+        """Execute an instruction other than a read. Of the broadcasts only a ping is answered, if
         supported."""
-        known = self._knows(packet.instruction) and (own or self.can("broadcast_ping"))
-        return known and super()._replies_to(packet, own)
+        replies = self._knows(packet.instruction) and (
+            packet.servo_id == self.servo_id or self.can("broadcast_ping")
+        )
+        answer = super().execute_packet(packet, now_ns)
+        return answer if replies else None
 
     def _obey(self, packet: InstructionPacket) -> Answer:
         known = packet.intact and self._knows(packet.instruction)
@@ -142,15 +163,6 @@ class SimulatedDevice(SimulatedNode):
 
     def _written(self, names: frozenset[str]) -> None:
         """Do nothing: writes to a device only change its registers."""
-
-    def _takes_part(self, read: GroupRead) -> bool:
-        bulk = read.instruction in (Instruction.BULK_READ, Instruction.FAST_BULK_READ)
-        return self.can("bulk_read" if bulk else "sync_read") and (
-            not read.fast or self.can("fast_sync_read")
-        )
-
-    def _state(self) -> int:
-        return 0
 
     # Live items
 

@@ -18,7 +18,6 @@ import msgspec
 
 from dxlsim.bus.ledger import FAULT
 from dxlsim.bus.simulated_bus import SimulatedBus
-from dxlsim.bus.simulated_line import flipped
 from dxlsim.faults.values import READERS, TURN, Reader, Value
 from dxlsim.servo.node import Node, SimulatedNode
 from dxlsim.servo.simulated_servo import SimulatedServo
@@ -42,6 +41,14 @@ _MS, _S = 1_000_000, 1_000_000_000
 LINE, PACKET, NODE, SERVO, DEVICE = "line", "packet", "node", "servo", "device"
 """Targets of a kind of fault: the line or its adapter; a packet of a servo or of the host; any unit on the
 line; a servo (with a shaft, or of a model); another device."""
+
+
+def flipped(packet: bytes, index: int, flip: int) -> bytes:
+    """Return a packet with the bits of `flip` inverted in the byte at `index`. Raises IndexError if the
+    packet is shorter."""
+    broken = bytearray(packet)
+    broken[index] ^= flip
+    return bytes(broken)
 
 
 class Hold(msgspec.Struct):

@@ -1,10 +1,13 @@
-"""Memory of a simulated servo or device: the registers of its control table as bytes and as integers on
-the wire."""
+"""Memory of a simulated servo or device: the registers of its control table as bytes, from which the line
+answers reads, and as integers on the wire."""
 
 from __future__ import annotations
 
+import ctypes
 import re
+import struct
 from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from typing import NamedTuple
 
 from dxlwire.control_table import ControlItem, ControlTable
@@ -22,7 +25,6 @@ class Cells(NamedTuple):
     items: tuple[ControlItem, ...]  # Their items; empty if a cell belongs to no item
     names: frozenset[str]
     whole: bool  # True if they consist of complete items
-    touched: bool  # True if at least one belongs to an item
     direct: bool  # True if none is Indirect Data
     read_only: bool  # True if at least one item is read-only
     eeprom: bool  # True if at least one item is in the EEPROM area
@@ -47,13 +49,10 @@ class Memory:
     def __init__(self, table: ControlTable, firmware: int) -> None:
         self.table = table = table.with_firmware(firmware)
         self.firmware = firmware
-        self.has_gaps = True
-        """True if addresses between items can be read, as 0; False if cells without any item are
-        unreadable."""
         self.size = table.size  # Bytes from address 0 to the end of the last item
         self._memory = bytearray(self.size)
-        # Same content as the bytes, for speed: reads are far more frequent than writes
-        self._values: dict[str, int] = {}
+        self.image = (ctypes.c_uint8 * self.size).from_buffer(self._memory)
+        """The same bytes, for compiled code."""
         self._cells_at: dict[tuple[int, int], Cells] = {}  # Cache, because hosts repeat the same accesses
         self._item_at: dict[int, ControlItem] = {
             address: item
@@ -62,6 +61,7 @@ class Memory:
         }
         self._indirect = _indirect_cells(table)
         self._places = {item.name: _place(item) for item in table.items.values()}
+        self._readers = {item.name: _reader(item, self._memory) for item in table.items.values()}
         self._watchers: dict[str, list[Callable[[], None]]] = {}
         self._live: dict[str, Callable[[], int]] = {}
         self.restore_factory_values()
@@ -84,18 +84,17 @@ class Memory:
                 self[name] = initial if item.initial is None else item.initial
 
     def __contains__(self, name: str) -> bool:
-        return name in self._values
+        return name in self._places
 
     def __getitem__(self, name: str) -> int:
-        return self._values[name]
+        return self._readers[name]()[0]
 
     def __setitem__(self, name: str, wire: int) -> None:
         start, end, mask, _, _ = self._places[name]
         wire &= mask
-        if self._values.get(name) == wire:
+        if self._readers[name]()[0] == wire:
             return
         self._memory[start:end] = wire.to_bytes(end - start, "little")
-        self._values[name] = wire
         if name in self._watchers:
             self._notify((name,))
 
@@ -111,7 +110,8 @@ class Memory:
 
     def get(self, name: str, otherwise: int = 0) -> int:
         """Return the integer of an item on the wire, or `otherwise` if the model lacks the item."""
-        return self._values.get(name, otherwise)
+        reader = self._readers.get(name)
+        return otherwise if reader is None else reader()[0]
 
     def show_value(self, name: str, wire: int) -> None:
         """Set an item from inside the unit, if the model has it; the value is clamped to the range of its
@@ -145,28 +145,33 @@ class Memory:
         item = self.table.items[name]
         return bytes(self._memory[item.address : item.address + item.size])
 
-    def read_bytes(self, address: int, length: int) -> bytes | None:
-        """Return the present bytes of a range as a host reads them, or None if the range is unreadable.
-
-        Cells between items are 0, and so are targets of Indirect Addresses beyond the table [i]."""
-        if length < 1 or address + length > self.size:
-            return None
+    def refresh_range(self, address: int, length: int) -> None:
+        """Set the live items in a range, or at the targets of its Indirect Data, to their present values."""
         cells = self.cells(address, length)
-        if not (cells.touched or self.has_gaps):
-            return None
         if cells.direct:
-            return self._now(cells, address, length)
-        places = self.places(address, length)
-        return b"".join(
-            self._now(self.cells(at, last - first), at, last - first) for at, first, last in places
-        )
+            self._refresh(cells)
+            return
+        for target, first, last in self.places(address, length):
+            self._refresh(self.cells(target, last - first))
 
-    def _now(self, cells: Cells, address: int, length: int) -> bytes:
+    def _refresh(self, cells: Cells) -> None:
         for name, show in cells.live:
             wire = show()
-            if wire != self._values[name]:
+            if wire != self._readers[name]()[0]:
                 self.show_value(name, wire)
-        return bytes(self._memory[address : address + length]).ljust(length, b"\0")
+
+    @property
+    def owned(self) -> ctypes.Array[ctypes.c_uint8]:
+        """One byte for each cell, 1 if the cell belongs to an item; for compiled code."""
+        return (ctypes.c_uint8 * self.size)(*(cell in self._item_at for cell in range(self.size)))
+
+    @property
+    def aliases(self) -> ctypes.Array[ctypes.c_int32]:
+        """Address of the Indirect Address (2 bytes) for each cell of Indirect Data, -1 for other cells; for
+        compiled code."""
+        items, found = self.table.items, self._indirect
+        addresses = (items[found[cell]].address if cell in found else -1 for cell in range(self.size))
+        return (ctypes.c_int32 * self.size)(*addresses)
 
     def runs(self, address: int, data: bytes) -> tuple[Run, ...]:
         """Return the parts of a write at their actual addresses: the given cells, or the targets of
@@ -206,7 +211,6 @@ class Memory:
                 items,
                 frozenset(names),
                 whole=whole,
-                touched=bool(owned),
                 direct=direct,
                 read_only=any(item.access == "R" for item in items),
                 eeprom=any(item.area == "EEPROM" for item in items),
@@ -241,7 +245,6 @@ class Memory:
         start, end = run.address, run.address + len(run.data)
         if self._memory[start:end] != run.data:
             self._memory[start:end] = run.data
-            self._values.update(run.after)
         if not self._watchers.keys().isdisjoint(run.after):
             self._notify(run.after)
 
@@ -257,6 +260,16 @@ def _place(item: ControlItem) -> tuple[int, int, int, int, int]:
     bits = 8 * item.size - item.signed
     lowest = -1 << bits if item.signed else 0
     return item.address, item.address + item.size, (1 << 8 * item.size) - 1, lowest, (1 << bits) - 1
+
+
+_FORMATS = {1: "<B", 2: "<H", 4: "<I"}
+
+
+def _reader(item: ControlItem, memory: bytearray) -> Callable[[], tuple[int, ...]]:
+    """Return a function that returns the integer of an item in the memory, as a tuple of one."""
+    if item.size in _FORMATS:
+        return partial(struct.Struct(_FORMATS[item.size]).unpack_from, memory, item.address)
+    return lambda: (int.from_bytes(memory[item.address : item.address + item.size], "little"),)
 
 
 def _indirect_cells(table: ControlTable) -> dict[int, str]:

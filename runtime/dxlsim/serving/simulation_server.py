@@ -332,7 +332,7 @@ class _ServedLine:
 
     def publish_delivery(self, now_ns: int) -> None:
         """Publish that bytes are delivered to the host now, with the time at which they were due."""
-        self._progress.publish_delivery(now_ns - self._bus.lateness_ns[-1], now_ns)
+        self._progress.publish_delivery(now_ns - self._bus.newest_lateness_ns, now_ns)
 
 
 @contextlib.contextmanager

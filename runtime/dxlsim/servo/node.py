@@ -1,77 +1,67 @@
-"""Node: base class of the units on a simulated line, servos and other devices: instructions, replies, and
-disturbances.
+"""Node: base class of the units on a simulated line, servos and other devices: instructions other than reads,
+and disturbances.
 
-Subclasses implement the meaning of the registers: `simulated_servo` has a shaft, `simulated_device` shows
-the measurements of a board."""
+The line in C answers reads from the registers. Subclasses implement the meaning of the registers:
+`simulated_servo` has a shaft, `simulated_device` shows the measurements of a board."""
 
 from __future__ import annotations
 
+import ctypes
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
-from typing import ClassVar, TypeVar
+from typing import ClassVar, NamedTuple, TypeVar
 
-import msgspec
-
-from dxlsim.registers.access import ErrorOf, refusal
+from dxlsim.registers.access import ACCESS, ErrorOf, refusal
 from dxlsim.registers.memory import Memory, Run
 from dxlsim.wire import servo_protocol1, servo_protocol2
-from dxlsim.wire.servo_packets import (
-    BROADCAST,
-    GroupRead,
-    Instruction,
-    InstructionPacket,
-    ListedWrites,
-    ReadEntry,
-    ServoReply,
-)
+from dxlsim.wire.compiled_line import NodeState
+from dxlsim.wire.servo_packets import BROADCAST, Instruction, InstructionPacket, ListedWrites
 from dxlwire.control_table import ControlTable
 
 Answer = tuple[int, bytes]  # Error and parameters of a reply
 
+SYNC_READ, BULK_READ, FAST_SYNC_READ, FAST_BULK_READ = 1, 2, 4, 8
+"""Bits of the group reads to which a node replies."""
 
-class ServoCounts(msgspec.Struct):
+
+class ServoCounts(NamedTuple):
     """Counters of the packets of one servo or device since the start of the simulation."""
 
-    received: int = 0  # Intact instructions to it, including broadcasts
-    replied: int = 0
-    last_error: int = 0  # Error of its last reply, as in the packet
-
-    def reply(self, error: int) -> None:
-        """Count a reply with this error."""
-        self.replied += 1
-        self.last_error = error
+    received: int  # Intact instructions to it, including broadcasts
+    replied: int
+    last_error: int  # Error of its last reply, as in the packet
 
 
 class SimulatedNode(ABC):
-    """One servo or device on a simulated line. The bus calls `execute_packet` and `reply_to_group_read`;
-    faults and tests call the rest.
+    """One servo or device on a simulated line. The line calls `receives`, `present`, `execute_packet` and
+    `decline_group_read`; faults and tests call the rest.
 
     `note` is called with a text about each refusal and each fault."""
 
     kind: ClassVar[str]  # Word for the node in notes
-    answers_damaged = False
-    """True: a packet with a wrong checksum is answered by the manual's error; False: it is never answered
-    [?]."""
 
     def __init__(self, memory: Memory, error_of: ErrorOf, note: Callable[[str], None], now_ns: int) -> None:
         self._codec = servo_protocol1.CODEC if memory.table.protocol == 1.0 else servo_protocol2.CODEC
         self._error_of = error_of
         self.registers = memory  # Control items by name, as integers on the wire
         self.note = note
-        self.counts = ServoCounts()
-        self.servo_id = 0  # ID (3 or 7)
-        self.secondary_id: int | None = None
-        """Secondary ID (12), to which the node listens but never replies; None: it has none, or the feature
-        is off.
-
-        253 to 255 switch it off, and the ID has priority (e-Manual, X series)."""
-        self._silent = False
+        self._owned, self._aliases = memory.owned, memory.aliases
+        self.line = NodeState(
+            memory=ctypes.addressof(memory.image),
+            owned=ctypes.addressof(self._owned),
+            alias=ctypes.addressof(self._aliases),
+            size=memory.size,
+            has_gaps=1,
+            speaks=1,
+            secondary_id=-1,
+            now_ns=now_ns,
+            deaf_until_ns=now_ns,
+            level_at=_address(memory, "status_return_level"),
+            error_at=-1,
+        )
+        """State of the node that the line uses: its ID and rate, when it receives, how it replies."""
         self._contacts: list[Callable[[], bool]] = []
         """Functions that return True if the cable has contact when an instruction arrives; all must."""
-        self._later_ns = 0  # Additional delay of its replies
-        self._deaf_until_ns = now_ns
-        """Time (ns) until which the node boots or processes a write, and receives nothing."""
-        self._delay_ns = 0  # Return Delay Time (5, 9)
         memory.show_live(self._live_items())
         memory.watch_items(("return_delay_time",), self._set_delay)
 
@@ -80,14 +70,51 @@ class SimulatedNode(ABC):
         """Name of the node in notes of the ledger: `servo 3`."""
         return f"{self.kind} {self.servo_id}"
 
+    @property
+    def servo_id(self) -> int:
+        """ID (3 or 7)."""
+        return int(self.line.id)
+
+    @property
+    def secondary_id(self) -> int | None:
+        """Secondary ID (12), to which the node listens but never replies; None: it has none, or the feature
+        is off.
+
+        253 to 255 switch it off, and the ID has priority (e-Manual, X series)."""
+        return None if self.line.secondary_id < 0 else int(self.line.secondary_id)
+
+    @property
+    def counts(self) -> ServoCounts:
+        """Counters of the node's packets."""
+        return ServoCounts(self.line.received, self.line.replied, self.line.last_error)
+
+    @property
+    def answers_damaged(self) -> bool:
+        """True: a packet with a wrong checksum is answered by the manual's error; False: it is never
+        answered [?]."""
+        return bool(self.line.answers_damaged)
+
+    @answers_damaged.setter
+    def answers_damaged(self, on: bool) -> None:
+        self.line.answers_damaged = on
+
+    @property
+    def is_silent(self) -> bool:
+        """True while the node's data line is cut."""
+        return bool(self.line.silent)
+
     def _set_delay(self) -> None:
-        self._delay_ns = self.registers.get("return_delay_time") * 2000 + self._later_ns
+        self.line.delay_ns = self.registers.get("return_delay_time") * 2000 + self.line.later_ns
 
-    # Interface to the bus
+    def _watch_identity(self) -> None:
+        self.registers.watch_items(ACCESS.identity, self._identify)
 
-    def listens_to(self, servo_id: int) -> bool:
-        """Return True if an instruction to `servo_id`, or a broadcast, is for this node."""
-        return servo_id == BROADCAST or servo_id in (self.servo_id, self.secondary_id)
+    def _identify(self) -> None:
+        """Let the line know ID and rate."""
+        self.line.id = self.registers["id"]
+        self.line.baud_rate = self.baud_rate
+
+    # Interface to the line
 
     @property
     def baud_rate(self) -> int:
@@ -97,35 +124,48 @@ class SimulatedNode(ABC):
         value, rates = registers[baud_item(registers)], registers.table.baud_rates
         return rates.get(value, 2_000_000 // (value + 1) if registers.table.protocol == 1.0 else 0)
 
-    def execute_packet(self, packet: InstructionPacket, now_ns: int) -> ServoReply | None:
-        """Execute an instruction whose last byte arrived at `now_ns`; return the reply, or None if the
-        node sends none."""
-        servo_id = self.servo_id  # A write of ID is still answered with the old ID [i]
-        own = packet.servo_id == servo_id
-        if not (own or self.listens_to(packet.servo_id)) or not self.receives(now_ns):
-            return None
-        replies = self._replies_to(packet, own)
-        delay_ns = self._delay_of(packet) if replies else 0
+    @abstractmethod
+    def receives(self, now_ns: int) -> bool:
+        """Return True if the node receives an instruction that ends at `now_ns`, which it does unless it is
+        silent or booting.
+
+        The line asks only if the node's state demands it."""
+
+    @abstractmethod
+    def present(self, now_ns: int, address: int, length: int) -> None:
+        """Set the registers of a range to their values at `now_ns`, because they are about to be read."""
+
+    def execute_packet(self, packet: InstructionPacket, now_ns: int) -> Answer | None:
+        """Execute an instruction other than a read, whose last byte arrived at `now_ns`.
+
+        Returns:
+            Error and data for a reply; None: the node never replies to the instruction.
+        """
+        called = self.called  # A write may change the ID
         error, parameters = self._obey(packet)
         if error:
-            refused = f"{packet.instruction:#04x} {packet.parameters.hex(' ')}"
-            self.note(f"{self.kind} {servo_id} refuses {refused}: {self._codec.error(error)!r}")
-            self.apply_protection(error)
-        return ServoReply(servo_id, error | self._state(), parameters, delay_ns) if replies else None
+            self.refuse_instruction(packet, error, called)
+        return error, parameters
 
-    def reply_to_group_read(self, read: GroupRead, entry: ReadEntry, now_ns: int) -> ServoReply | None:
-        """Return the node's reply to a group read that ended at `now_ns`, or None if it sends none."""
-        if not self.receives(now_ns) or not self._takes_part(read):
-            return None
-        if self.registers.get("status_return_level", 2) < 1:
-            return None
-        error, data = self._answer_read(entry.address, entry.length)
-        if read.fast and error:  # Its format has no room for an error without data [i]
-            self._stays_out(read)
-            return None
-        # In a shared status packet only the first servo waits its Return Delay Time.
-        delay_ns = self._later_ns if read.fast and entry is not read.entries[0] else self._delay_ns
-        return ServoReply(self.servo_id, error | self._state(), data, delay_ns)
+    def refuse_instruction(self, packet: InstructionPacket, error: int, called: str = "") -> None:
+        """Note that an instruction is refused with an error, which may cause a shutdown."""
+        refused = f"{packet.instruction:#04x} {packet.parameters.hex(' ')}"
+        self.note(f"{called or self.called} refuses {refused}: {self._codec.error(error)!r}")
+        self.apply_protection(error)
+
+    def decline_group_read(self, packet: InstructionPacket, entries: int, *, failed: bool) -> None:
+        """Note that the node does not reply to a group read of so many entries.
+
+        Args:
+            packet: The instruction.
+            entries: Number of entries.
+            failed: True: it cannot reply with an error; False: it does not support the instruction.
+        """
+        if failed:
+            self._stay_out(packet)
+
+    def _stay_out(self, packet: InstructionPacket) -> None:
+        self.note(f"{self.called} does not reply to the fast read {packet.instruction:#04x}")
 
     # Differences between kinds of nodes
 
@@ -134,17 +174,9 @@ class SimulatedNode(ABC):
         """Advance the node to `now_ns`; an earlier time is ignored."""
 
     @abstractmethod
-    def receives(self, now_ns: int) -> bool:
-        """Return True if the node receives an instruction that ends at `now_ns`: it is connected, has
-        booted, and is not silenced."""
-
-    @abstractmethod
     def _live_items(self) -> Mapping[str, Callable[[], int]]:
         """Return the items that show present values, each with the function that returns the integer on
         the wire."""
-
-    @abstractmethod
-    def _state(self) -> int: ...
 
     @abstractmethod
     def apply_protection(self, refused: int = 0) -> None:
@@ -168,37 +200,10 @@ class SimulatedNode(ABC):
     def _set(self, name: str, wire: int) -> None: ...
 
     @abstractmethod
-    def _takes_part(self, read: GroupRead) -> bool:
-        """Return True if the node supports a group read (sync or bulk read), so that it replies."""
-
-    @abstractmethod
     def _written(self, names: frozenset[str]) -> None:
         """Apply the side effects of a write to these items."""
 
     # Instructions
-
-    def _replies_to(self, packet: InstructionPacket, own: bool) -> bool:
-        """Return True if a status packet follows an instruction (Status Return Level). Of the broadcasts only
-        a ping is answered.
-
-        A packet with a wrong checksum is not answered, unless `answers_damaged` asks for the manual's
-        error.
-
-        Args:
-            packet: The instruction.
-            own: The instruction is to the node's ID; instructions to the Secondary ID are not answered.
-        """
-        level = self.registers.get("status_return_level", 2)
-        if not packet.intact:
-            return own and self.answers_damaged and level >= 2
-        if packet.instruction == Instruction.PING:
-            return own or packet.servo_id == BROADCAST
-        return own and level >= (1 if packet.instruction == Instruction.READ else 2)
-
-    def _delay_of(self, packet: InstructionPacket) -> int:
-        if packet.servo_id != BROADCAST or packet.instruction != Instruction.PING:
-            return self._delay_ns
-        return self._delay_ns + self.servo_id * self._codec.ping_slot_ns(self.baud_rate)
 
     def _obey(self, packet: InstructionPacket) -> Answer:
         """Execute an instruction and return error and data of its reply; a packet with a wrong checksum is
@@ -210,8 +215,6 @@ class SimulatedNode(ABC):
         match packet.instruction:
             case Instruction.SYNC_WRITE | Instruction.BULK_WRITE if packet.servo_id == BROADCAST:
                 answer = self._write_listed(codec.listed_writes(packet)), b""
-            case Instruction.READ if (place := codec.read(parameters)) is not None:
-                answer = self._answer_read(*place)
             case Instruction.WRITE if (write := codec.write(parameters)) is not None:
                 answer = self._write_to(packet.servo_id, *write), b""
             case Instruction.PING:
@@ -223,14 +226,6 @@ class SimulatedNode(ABC):
         """Execute an instruction other than reads and writes; return the error, which for an unknown one
         is not 0."""
         return self._codec.unknown
-
-    def _stays_out(self, read: GroupRead) -> None:
-        self.note(f"{self.called} does not reply to the fast read {read.instruction:#04x}")
-
-    def _answer_read(self, address: int, length: int) -> Answer:
-        """Return error and bytes for a read; cells between items are 0 [i]."""
-        data = self.registers.read_bytes(address, length)
-        return (self._codec.no_cells, b"") if data is None else (0, data)
 
     def _write_to(self, servo_id: int, address: int, data: bytes) -> int:
         return self._beyond_shadow(servo_id, address, data) or self._write(address, data)
@@ -279,12 +274,13 @@ class SimulatedNode(ABC):
     def silence(self, on: bool = True) -> None:
         """Cut the node's data line, or restore it. A cut node receives and sends nothing, but keeps
         moving."""
-        self._silent = on
+        self.line.silent = on
         self.note(f"{self.called}: data line {'cut' if on else 'restored'}")
 
     def interrupt(self, contact: Callable[[], bool]) -> None:
         """From now on pass instructions and replies of this node only while `contact` returns True."""
         self._contacts.append(contact)
+        self.line.asks = 1
         self.note(f"{self.called}: cable loose")
 
     def connect(self, contact: Callable[[], bool]) -> None:
@@ -294,17 +290,22 @@ class SimulatedNode(ABC):
 
     def reply_later(self, by_ns: int) -> None:
         """Delay each reply by an additional time, ns; 0 ends this."""
-        self._later_ns = by_ns
+        self.line.later_ns = by_ns
         self._set_delay()
         self.note(f"{self.called}: replies delayed by {by_ns} ns")
 
     def cut_power(self, until_ns: int) -> None:
         """Cut the node's power until `until_ns`: RAM is lost, and the node receives nothing before."""
         self.power_cycle()
-        self._receive_nothing_until(max(self._deaf_until_ns, until_ns))
+        self._receive_nothing_until(max(self.line.deaf_until_ns, until_ns))
 
     def _receive_nothing_until(self, t_ns: int) -> None:
-        self._deaf_until_ns = t_ns
+        self.line.deaf_until_ns = t_ns
+
+    def refuse_reads(self, *addresses: int) -> None:
+        """Refuse each read of a range with one of these cells, like firmware that lacks their items."""
+        for address in addresses:
+            self._owned[address] = 2
 
     def poke(self, name: str, wire: int) -> None:
         """Set a register to an integer on the wire, without checks, as if it had been set before."""
@@ -333,3 +334,9 @@ def baud_value(table: ControlTable, baud_rate: int) -> int:
 def baud_item(memory: Memory) -> str:
     """Return the name of the item with the baud rate of the bus; the Y series has two rates."""
     return "baud_rate" if "baud_rate" in memory else "baud_rate_bus"
+
+
+def _address(memory: Memory, name: str) -> int:
+    """Return the address of an item, -1 if the model lacks it."""
+    item = memory.table.items.get(name)
+    return -1 if item is None else item.address

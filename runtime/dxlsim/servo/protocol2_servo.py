@@ -11,9 +11,10 @@ from collections.abc import Callable
 from dxlsim.motion.shaft import Shaft
 from dxlsim.registers.access import ACCESS, OperatingMode, torque_error, watchdog_expired
 from dxlsim.registers.memory import Memory, Run
+from dxlsim.servo.node import BULK_READ, FAST_BULK_READ, FAST_SYNC_READ, SYNC_READ
 from dxlsim.servo.simulated_servo import SimulatedServo
-from dxlsim.wire.servo_packets import BROADCAST, GroupRead, Instruction, InstructionPacket
-from dxlsim.wire.servo_protocol2 import ALERT, StatusErrorNumber
+from dxlsim.wire.servo_packets import BROADCAST, Instruction, InstructionPacket
+from dxlsim.wire.servo_protocol2 import StatusErrorNumber
 from dxlwire.control_table import ControlItem
 
 WATCHDOG_UNIT_NS = 20_000_000
@@ -50,21 +51,28 @@ class Protocol2Servo(SimulatedServo):
         self._shut_down = False
         self._check_ns: int | None = None  # Time of the next Bus Watchdog check; None: no check
         super().__init__(memory, torque_error, shaft, note)
-        memory.has_gaps = False
+        # Addresses between items can be read, as 0, but not cells without any item
+        self.line.has_gaps = 0
+        if self._errors.item in memory:
+            item = memory.table.items[self._errors.item]
+            self.line.error_at, self.line.error_size = item.address, item.size
+        memory.watch_items(("firmware_version",), self._support_group_reads)
         memory.watch_items(("bus_watchdog", "torque_enable"), self._plan_watchdog)
 
     def _identify(self) -> None:
         super()._identify()
-        self._speaks = self.registers.get("protocol_type", 2) in _SPEAKS
+        self.line.speaks = self.registers.get("protocol_type", 2) in _SPEAKS
 
     # Instructions
 
-    def _takes_part(self, read: GroupRead) -> bool:
+    def _support_group_reads(self) -> None:
         first = self.registers.table.fast_sync_read_firmware
-        known = not read.fast or (first is not None and self.registers["firmware_version"] >= first)
-        if not known:
-            self._stays_out(read)
-        return known
+        fast = first is not None and self.registers["firmware_version"] >= first
+        self.line.group_reads = SYNC_READ | BULK_READ | (fast and FAST_SYNC_READ | FAST_BULK_READ)
+
+    def decline_group_read(self, packet: InstructionPacket, entries: int, *, failed: bool) -> None:
+        """Note that the servo does not reply to a fast read."""
+        self._stay_out(packet)
 
     def _manage(self, packet: InstructionPacket) -> int:
         """Execute an instruction other than reads and writes; return an instruction error for an unknown one.
@@ -112,7 +120,7 @@ class Protocol2Servo(SimulatedServo):
 
     def _plan_watchdog(self) -> None:
         units = self._watchdog_units()
-        end_ns = self._received_ns + units * WATCHDOG_UNIT_NS
+        end_ns = self.line.received_ns + units * WATCHDOG_UNIT_NS
         if units and (self._check_ns is None or end_ns < self._check_ns):
             self._check_ns = end_ns
             self.shaft.mechanics.call_at(end_ns, lambda: self._check_watchdog(end_ns))
@@ -130,7 +138,7 @@ class Protocol2Servo(SimulatedServo):
             return  # A shorter timeout was set in the meantime
         self._check_ns = None
         units = self._watchdog_units()
-        if not units or self.shaft.mechanics.grid_ns < self._received_ns + units * WATCHDOG_UNIT_NS:
+        if not units or self.shaft.mechanics.grid_ns < self.line.received_ns + units * WATCHDOG_UNIT_NS:
             self._plan_watchdog()
             return
         self.note(f"servo {self.servo_id}: bus watchdog after {units * 20} ms")
@@ -147,11 +155,6 @@ class Protocol2Servo(SimulatedServo):
         After a shutdown torque stays off until a reboot: a result fail [i]."""
         torque = self._shut_down and run.after.get("torque_enable")
         return super()._refusal(run) or (StatusErrorNumber.RESULT_FAIL if torque else 0)
-
-    def _state(self) -> int:
-        """Return the error bits of every reply: the alert bit while Hardware Error Status or Error Code
-        reports an error."""
-        return ALERT if self.registers.get(self._errors.item) else 0
 
     def apply_protection(self, refused: int = 0) -> None:
         """Show active errors in the registers, and switch torque off until a reboot if Shutdown lists one
@@ -283,7 +286,7 @@ class Protocol2Servo(SimulatedServo):
     def _start_up(self) -> None:
         registers = self.registers
         self._shut_down = False
-        self._started_ns = self._received_ns = self.shaft.now_ns
+        self._started_ns = self.line.received_ns = self.shaft.now_ns
         if "torque_limit" in registers and "max_torque" in registers:
             registers["torque_limit"] = registers["max_torque"]
         registers.show_value("backup_ready", bool(self._backup))

@@ -16,10 +16,10 @@ from collections.abc import Callable, Mapping
 
 from dxlsim.motion.mechanics import SUPPLY_OHM
 from dxlsim.motion.shaft import Shaft
-from dxlsim.registers.access import ACCESS, ErrorOf, lock_error
+from dxlsim.registers.access import ErrorOf, lock_error
 from dxlsim.registers.memory import Memory
-from dxlsim.servo.node import SimulatedNode
-from dxlsim.wire.servo_packets import GroupRead, Instruction, InstructionPacket
+from dxlsim.servo.node import BULK_READ, Answer, SimulatedNode
+from dxlsim.wire.servo_packets import Instruction, InstructionPacket
 from dxlsim.wire.servo_protocol1 import ErrorBit
 
 BOOT_NS = 100_000_000  # Time without reception after a reboot; the manuals give no value [i]
@@ -34,51 +34,56 @@ class SimulatedServo(SimulatedNode):
 
     def __init__(self, memory: Memory, error_of: ErrorOf, shaft: Shaft, note: Callable[[str], None]) -> None:
         self.shaft = shaft
-        self.overload = False  # True while the load exceeds the torque of the shaft
+        self._overload = False
         self.wakes_on_goal = True
         """True: in Protocol 1.0 a write of Goal Position (30) while Torque Enable (24) is 0 sets Torque
         Enable to 1 [i]."""
         self.boot_ns = BOOT_NS
         """Duration of a reboot or a factory reset by an instruction of Protocol 2.0, ns."""
         self.write_time_ns = 0  # Time without reception after an instruction that writes
-        self._speaks = True  # False if another protocol is set
-        self._started_ns = self._received_ns = shaft.now_ns
+        self._started_ns = shaft.now_ns
         self._registered: tuple[int, bytes] | None = None
         super().__init__(memory, error_of, note, shaft.now_ns)
+        self.line.received_ns = shaft.now_ns
         self._secondary_item = next((each for each in _SECONDARY_IDS if each in memory), None)
         self._voltage = 0.0
         self.voltage = _supply(memory)
         shaft.mechanics.watch_servo(shaft.index, self._strained)
-        memory.watch_items(ACCESS.identity, self._identify)
+        self._watch_identity()
 
     def _identify(self) -> None:
-        registers = self.registers
-        self.servo_id = registers["id"]
-        secondary = None if self._secondary_item is None else registers[self._secondary_item]
-        off = secondary is None or secondary > 252 or secondary == self.servo_id
-        self.secondary_id = None if off else secondary
+        super()._identify()
+        secondary = 255 if self._secondary_item is None else self.registers[self._secondary_item]
+        off = secondary > 252 or secondary == self.servo_id
+        self.line.secondary_id = -1 if off else secondary
 
-    # Interface to the bus
+    # Interface to the line
 
     def advance_to(self, now_ns: int) -> None:
         """Advance the shaft and the registers that show it to `now_ns`; an earlier time is ignored."""
         self.shaft.advance_to(now_ns)
+        self.line.now_ns = self.shaft.now_ns
         self.registers.refresh()
 
     def receives(self, now_ns: int) -> bool:
-        """Return True if the servo receives an instruction that ends at `now_ns`; if so, the shaft is
-        advanced and the Bus Watchdog's time restarts."""
-        if self._silent or now_ns < self._deaf_until_ns or not self._speaks:
-            return False
+        """Return True if the cable has contact at `now_ns`; the line asks while the cable is loose."""
         self.shaft.advance_to(now_ns)
-        if self._contacts and not all(contact() for contact in self._contacts):
-            return False
-        self._received_ns = self.shaft.now_ns
-        return True
+        return all(contact() for contact in self._contacts)
+
+    def present(self, now_ns: int, address: int, length: int) -> None:
+        """Advance the shaft to `now_ns`, and the registers of a range that show it."""
+        self.shaft.advance_to(now_ns)
+        if length:
+            self.registers.refresh_range(address, length)
+
+    def execute_packet(self, packet: InstructionPacket, now_ns: int) -> Answer | None:
+        """Advance the shaft to `now_ns`, and execute an instruction other than a read."""
+        self.shaft.advance_to(now_ns)
+        return super().execute_packet(packet, now_ns)
 
     def excuse(self, duration_ns: int) -> None:
         """Do not count a stall of this process, of `duration_ns`, toward the timeout of the Bus Watchdog."""
-        self._received_ns += duration_ns
+        self.line.received_ns += duration_ns
 
     # Differences between the protocols
 
@@ -103,7 +108,8 @@ class SimulatedServo(SimulatedNode):
     def _write(self, address: int, data: bytes) -> int:
         error = super()._write(address, data)
         if self.write_time_ns and not error:
-            self._receive_nothing_until(max(self._deaf_until_ns, self._received_ns + self.write_time_ns))
+            line = self.line
+            self._receive_nothing_until(max(line.deaf_until_ns, line.received_ns + self.write_time_ns))
         return error
 
     def _written(self, names: frozenset[str]) -> None:
@@ -148,11 +154,15 @@ class SimulatedServo(SimulatedNode):
         drawn = abs(self.shaft.duty * self.shaft.current)
         return round((self._voltage - SUPPLY_OHM * drawn) / self.registers.table.items[name].scale)
 
+    def _show_errors(self) -> None:
+        """Update the error bits of replies that do not depend on registers alone."""
+
     def _strained(self) -> None:
         """React to a new temperature, in whole degrees, or to an overload, which the mechanics report."""
         if not self.overload and self.shaft.mechanics.overloaded(self.shaft.index):
             self.overload = True
             self.note(f"servo {self.servo_id}: overload: the load turns the shaft")
+        self._show_errors()
         self.apply_protection()
 
     def power_up(self) -> None:
@@ -183,6 +193,16 @@ class SimulatedServo(SimulatedNode):
         return self.shaft.torque_on
 
     @property
+    def overload(self) -> bool:
+        """True while the load exceeds the torque of the shaft."""
+        return self._overload
+
+    @overload.setter
+    def overload(self, on: bool) -> None:
+        self._overload = on
+        self._show_errors()
+
+    @property
     def voltage(self) -> float:
         """Supply voltage of the servo, V; the servo measures less while it draws current."""
         return self._voltage
@@ -191,6 +211,7 @@ class SimulatedServo(SimulatedNode):
     def voltage(self, volts: float) -> None:
         self._voltage = volts
         self.shaft.mechanics.supply(self.shaft.index, volts)
+        self._show_errors()
 
     @property
     def temperature(self) -> float:
@@ -201,6 +222,7 @@ class SimulatedServo(SimulatedNode):
     @temperature.setter
     def temperature(self, celsius: float) -> None:
         self.shaft.mechanics.heat(self.shaft.index, celsius)
+        self._show_errors()
 
     def jam_shaft(self, on: bool) -> None:
         """Block the shaft at its present angle, or release it."""
@@ -251,6 +273,9 @@ class Protocol1Servo(SimulatedServo):
 
     def __init__(self, memory: Memory, shaft: Shaft, note: Callable[[str], None]) -> None:
         super().__init__(memory, lock_error, shaft, note)
+        self.line.least_entries = 2
+        self.line.group_reads = BULK_READ if "bulk_read" in memory.table.capabilities else 0
+        memory.watch_items(("min_voltage_limit", "max_voltage_limit", "temperature_limit"), self._show_errors)
 
     def _manage(self, packet: InstructionPacket) -> int:
         """Execute an instruction other than reads and writes; an AX rejects a bulk read as unknown [i]."""
@@ -260,17 +285,16 @@ class Protocol1Servo(SimulatedServo):
         self.power_up()
         return 0
 
-    def _takes_part(self, read: GroupRead) -> bool:
-        """Return True if the servo replies to a group read: a bulk read of two servos or more, on MX
-        models only."""
-        known = "bulk_read" in self.registers.table.capabilities and len(read.entries) >= 2
-        if not known:
-            self.note(f"servo {self.servo_id} refuses a bulk read of {len(read.entries)}")
-        return known
+    def decline_group_read(self, packet: InstructionPacket, entries: int, *, failed: bool) -> None:
+        """Note that the servo refuses a bulk read: MX models answer those of two servos or more."""
+        self.note(f"servo {self.servo_id} refuses a bulk read of {entries}")
 
     # Protection
 
-    def _state(self) -> int:
+    def _show_errors(self) -> None:
+        self.line.error_bits = self._errors_now()
+
+    def _errors_now(self) -> int:
         """Return the error bits of every reply; each persists as long as its cause."""
         registers, errors = self.registers, self.registers.table.errors
         error = errors.value_of("overload") if self.overload else 0
@@ -282,7 +306,7 @@ class Protocol1Servo(SimulatedServo):
 
     def apply_protection(self, refused: int = 0) -> None:
         """Set Torque Limit to 0 if Shutdown (18) lists an error; Torque Enable (24) does not change."""
-        error = self._state() | refused
+        error = self._errors_now() | refused
         if error & self.registers["shutdown"] and self.registers["torque_limit"]:
             self.note(f"servo {self.servo_id}: shutdown, torque limit 0: {ErrorBit(error)!r}")
             self._set("torque_limit", 0)

@@ -1,8 +1,8 @@
-"""Packets: common code of both protocols for simulated servos: instruction packets, replies, group reads,
-framing.
+"""Packets: common code of both protocols for simulated servos: instructions, group reads, listed writes.
 
-Written from the protocols alone (ROBOTIS e-Manual, "Protocol 1.0", "Protocol 2.0"), without the host's
-packet code: a common codec would hide its own errors."""
+`line.c` frames instructions and composes replies. All is written from the protocols alone (ROBOTIS
+e-Manual, "Protocol 1.0", "Protocol 2.0"), without the host's packet code: a common codec would hide its own
+errors."""
 
 from __future__ import annotations
 
@@ -47,15 +47,6 @@ class InstructionPacket(NamedTuple):
     raw: bytes = b""  # All of its bytes, as they were on the line
 
 
-class ServoReply(NamedTuple):
-    """Reply of a servo to an instruction, with its delay after the instruction's last byte."""
-
-    servo_id: int
-    error: int
-    parameters: bytes
-    delay_ns: int
-
-
 class ReadEntry(NamedTuple):
     """Address range that a group read asks of one servo."""
 
@@ -71,14 +62,6 @@ class GroupRead(msgspec.Struct, frozen=True):
     instruction: int
     entries: tuple[ReadEntry, ...]
     fast: bool = False  # True: the servos share one status packet
-    has_slots: bool = False
-    """True: a servo may wait for the slot of an absent servo before it [?]; False: it waits for the actual
-    reply."""
-
-    @property
-    def lengths(self) -> tuple[int, ...]:
-        """Number of bytes that each entry asks for."""
-        return tuple(each.length for each in self.entries)
 
 
 ListedWrites = Mapping[int, Sequence[tuple[int, int, int, bytes]]]
@@ -98,76 +81,12 @@ def sync_writes(listed: bytes, address: int, length: int) -> ListedWrites | None
 
 
 class PacketCodec(NamedTuple):
-    """Functions and constants with which simulated servos parse and build packets of a protocol:
+    """Functions and constants with which simulated servos parse the writes of a protocol:
     `protocol1.CODEC` and `protocol2.CODEC`. Functions return None for malformed input."""
 
-    header: bytes  # The ID follows the header
-    no_id: frozenset[int]  # Bytes that cannot be an ID
-    length_bytes: int  # Size of the length field, which follows the ID
-    shortest: int  # Smallest valid length
-    longest_pause_ns: int  # Longest gap inside an instruction
-    packet: Callable[[bytes, int], InstructionPacket]  # Parses the bytes of a packet, given its `end`
-    status_packet: Callable[[int, int, bytes], bytes]  # From ID, error and parameters
-    read: Callable[[bytes], tuple[int, int] | None]  # Address and length from the parameters of a read
+    protocol: float
     write: Callable[[bytes], tuple[int, bytes] | None]  # Address and data from the parameters of a write
     listed_writes: Callable[[InstructionPacket], ListedWrites | None]  # From a sync write or bulk write
-    group_read: Callable[[InstructionPacket], GroupRead | None]  # None also for other instructions
-    ping_slot_ns: Callable[[int], int]
-    """Delay (ns) between the answers of two successive IDs to a broadcast ping, at a baud rate."""
     error: Callable[[int], IntEnum | IntFlag]  # Enum member of an error
     damaged: int  # Error for a wrong checksum
     unknown: int  # Error for an unknown instruction, or wrong parameters
-    no_cells: int  # Error for an invalid address
-
-
-class InstructionReceiver:
-    """Extracts instruction packets from the bytes that a host sends on a line, despite noise; holds at
-    most one packet."""
-
-    def __init__(self, codec: PacketCodec) -> None:
-        self._codec = codec
-        self._held = b""
-
-    @property
-    def pending(self) -> int:
-        """Number of received bytes of an incomplete packet."""
-        return len(self._held)
-
-    def discard_packet(self) -> None:
-        """Discard the bytes of a packet that was not completed in time."""
-        self._held = b""
-
-    def feed_bytes(self, data: bytes | bytearray, start: int = 0) -> InstructionPacket | None:
-        """Process `data` from `start` until a packet is complete, and return the packet.
-
-        None means that all bytes were processed without completing a packet. A packet with a wrong
-        checksum is returned, too. Continue at `packet.end`."""
-        held = len(self._held)
-        seen = self._held + data[start:]
-        at = 0
-        while not self._may_begin(seen[at : at + 8]):
-            at += 1
-        size = self._size(seen[at : at + 8])
-        if size is None or at + size > len(seen):
-            self._held = bytes(seen[at:])
-            return None
-        self._held = b""
-        end = at + size
-        return self._codec.packet(bytes(seen[at:end]), start + end - held)
-
-    def _size(self, head: bytes) -> int | None:
-        """Return the size of a packet with this beginning, bytes, or None if the beginning is too short."""
-        codec = self._codec
-        begin = len(codec.header) + 1
-        end = begin + codec.length_bytes
-        return None if len(head) < end else end + int.from_bytes(head[begin:end], "little")
-
-    def _may_begin(self, head: bytes) -> bool:
-        """Return True if a packet can begin with these bytes: header, valid ID, valid length."""
-        header, no_id = self._codec.header, self._codec.no_id
-        if not head.startswith(header[: len(head)]):
-            return False
-        if len(head) > len(header) and head[len(header)] in no_id:
-            return False
-        size = self._size(head)
-        return size is None or size >= len(header) + 1 + self._codec.length_bytes + self._codec.shortest

@@ -20,17 +20,18 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 from tests.kit.awaited import DEADLINE_S
+from tests.kit.line_faults import change_replies, watch_instructions
 
 from dxlrun.channels.commands import CommandMessage, QueueInbox
 from dxlrun.log.log_reader import Log, read_log
 from dxlrun.run import virtual_run
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.testing import simulated_robot
-from dxlsim.bus.simulated_bus import SimulatedBus
-from dxlsim.bus.simulated_line import LineTransmission
+from dxlsim.bus.simulated_bus import DisturbedReply, PacketFault, SimulatedBus
 from dxlsim.faults.fault import parse_fault
 from dxlsim.faults.script import FaultScript
 from dxlsim.servo.simulated_servo import SimulatedServo
+from dxlsim.wire.compiled_line import group_read
 from dxlwire.clock import VirtualClock
 from dxlwire.wire import protocol1, protocol2
 
@@ -234,35 +235,23 @@ class Story:
     def on_request(self, joint: str | int, decide: Callable[[tuple[int, ...], float], None]) -> None:
         """Call `decide` with the IDs that are about to reply to a read, and the time, before they do."""
 
-        def watch(execute: Callable[[Any, int], None]) -> Callable[[Any, int], None]:
-            def watched(packet: Any, end_ns: int) -> None:
-                read = self.bus(joint)._codec.group_read(packet)
-                if read is not None:
-                    decide(tuple(entry.servo_id for entry in read.entries), end_ns / S)
-                elif packet.instruction == 0x02 and packet.servo_id != 0xFE:
-                    decide((packet.servo_id,), end_ns / S)
-                execute(packet, end_ns)
+        def watched(packet: Any, end_ns: int) -> None:
+            read = group_read(self.kind.protocol, packet)
+            if read is not None:
+                decide(tuple(entry.servo_id for entry in read.entries), end_ns / S)
+            elif packet.instruction == 0x02 and packet.servo_id != 0xFE:
+                decide((packet.servo_id,), end_ns / S)
 
-            return watched
-
-        self.prepared.append(lambda: instead(self.bus(joint), "_execute", watch))
+        self.prepared.append(lambda: watch_instructions(self.bus(joint), watched))
 
     def on_arrival(self, joint: str | int, change: Callable[[int, bytes, float], bytes]) -> None:
         """Change bytes between line and host: `change` gets ID, bytes and time; the servos notice nothing."""
 
-        def watch(arrive: Callable[[LineTransmission], None]) -> Callable[[LineTransmission], None]:
-            def changed(each: LineTransmission) -> None:
-                if each.note != "noise":
-                    at = 2 if self.kind.protocol < 2 else 4
-                    servo_id = each.group.turns[each.turn].servo_id if each.group else each.data[at]
-                    each.data = change(servo_id, each.data, each.due_ns / S)
-                    if not each.data:
-                        return
-                arrive(each)
+        def changed(servo_id: int, reply: DisturbedReply) -> PacketFault | None:
+            data = change(servo_id, reply.data, reply.due_ns / S)
+            return None if data == reply.data else PacketFault("", lambda _: data, is_noticed=False)
 
-            return changed
-
-        self.prepared.append(lambda: instead(self.bus(joint), "_arrive", watch))
+        self.prepared.append(lambda: change_replies(self.bus(joint), changed))
 
     def hold_back(self, bus: SimulatedBus, late_ns: Callable[[int], int]) -> None:
         """Hand intact bytes of a bus over later, by a time that depends on the time."""

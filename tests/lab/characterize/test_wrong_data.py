@@ -147,7 +147,7 @@ def test_the_range_that_is_named_does(measures, model):
 
 def lose(rig: Any, cycle: int) -> None:
     bus = rig.robot.link.simulated.buses[0]
-    if bus.now_ns > 25_000_000_000 and not bus.servo(1)._silent:
+    if bus.now_ns > 25_000_000_000 and not bus.servo(1).is_silent:
         bus.servo(1).silence()
 
 
