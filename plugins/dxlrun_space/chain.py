@@ -49,18 +49,18 @@ class Chain:
         urdf: The robot's URDF.
         base: Link in whose axes poses are given; empty: the root.
         tip: Link that is moved.
-        joints: Joints that the chain may move, in the order of its positions.
+        joints: Joints that the chain may move, in the order of its positions; empty: all that move the tip.
 
     Raises:
         WrongChain: A link is unknown, the base is not above the tip, a joint of the chain is missing, follows
             another one, or is not in the chain.
     """
 
-    def __init__(self, urdf: Urdf, base: str, tip: str, joints: Sequence[str]) -> None:
-        self.joints = tuple(joints)
+    def __init__(self, urdf: Urdf, base: str, tip: str, joints: Sequence[str] = ()) -> None:
         self.base = base or urdf.root
         self.tip = tip
         ways = _ways(urdf, self.base, tip)
+        self.joints = joints = tuple(joints) or tuple(joint.name for joint in ways if joint.moves)
         _check_joints(ways, joints)
         order = {name: index for index, name in enumerate(joints)}
         steps: list[_JointStep] = []
@@ -167,6 +167,8 @@ def _ways(urdf: Urdf, base: str, tip: str) -> list[UrdfJoint]:
 
 def _check_joints(ways: Sequence[UrdfJoint], joints: Sequence[str]) -> None:
     moving = [joint for joint in ways if joint.moves]
+    if not moving:
+        raise WrongChain("tip", "no joint moves the tip in the base", "name a link below a joint")
     for joint in moving:
         if joint.mimic is not None:
             what = f"the chain passes {joint.name}, which mimics {joint.mimic.joint}"

@@ -1,10 +1,14 @@
-"""Plug-in of the controller in space."""
+"""Plug-in of the controller in space, of poses in the robot file, and of `dxlrun reach`."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
-from dxlrun import CONTRACT_VERSION, hookimpl
+from dxlrun import CONTRACT_VERSION, Command, hookimpl
+
+if TYPE_CHECKING:
+    from dxlrun.tooling.features import Feature
 
 
 @hookimpl
@@ -17,3 +21,18 @@ def dxlrun_contract() -> int:
 def dxlrun_controllers() -> Mapping[str, str]:
     """Return the import path of the controller, by its type in the robot file."""
     return {"cartesian_controller": "dxlrun_space.cartesian_controller:CartesianController"}
+
+
+@hookimpl
+def dxlrun_features() -> Sequence[Feature]:
+    """Return the section `tip_poses`, whose files are in this package."""
+    # Imported here because most commands read no robot file.
+    from dxlrun.tooling.features import Feature
+
+    return [Feature("tip_poses", "dxlrun_space")]
+
+
+@hookimpl
+def dxlrun_commands() -> Sequence[Command]:
+    """Return the command, whose function is imported on use."""
+    return [Command("reach", "dxlrun_space.reach:draw_reach", group="Robot files")]

@@ -28,6 +28,7 @@ WITHOUT_MOTION = {
     "wave",
     "open_manipulator_x_space",
     "koch_leads_open_manipulator_x",
+    "koch_space",
 } | {
     *("bioloid_torso_keyframes", "stand_up")  # theirs are in their own files
 }

@@ -40,10 +40,11 @@ RAD_PER_TICK = np.radians(300) / 1023
 
 @pytest.fixture(autouse=True)
 def with_backlash(project: Callable[..., Path]) -> Iterator[None]:
-    """Install the package whose files are on the page."""
+    """Install the package whose files are on the page, and the layer that the page names."""
     section = PAGE.read_text().partition("## A key of joints")[2]
     texts = re.findall(r"```python\n(.*?)```", section, re.S)
-    files = dict(zip(("joint_key", "compile", "layer"), texts, strict=False))
+    layer = Path(__file__).with_name("backlash").joinpath("layer.py").read_text()
+    files = {**dict(zip(("joint_key", "compile"), texts, strict=False)), "layer": layer}
     with installed(project("backlash", **files)):
         yield
     robot_form.cache_clear()

@@ -29,6 +29,7 @@ def test_every_robot_compiles_and_has_motions(path):
     others = {"bioloid_torso_imu", "bioloid_torso_keyframes", "single_joint_feed_forward", "stand_up"}
     others |= {
         "koch_leads_open_manipulator_x",
+        "koch_space",
         "leader_follower_two_ports",
         "open_manipulator_x_space",
         "wave",

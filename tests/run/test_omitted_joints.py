@@ -15,7 +15,14 @@ from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun_analysis.replay import replay_log
 
 ROBOTS = Path(__file__).parents[2] / "robots"
-ALONE = ("single_joint", "held_arm", "koch_leads", "open_manipulator_x_space")  # no joint can be omitted
+ALONE = (
+    "single_joint",
+    "held_arm",
+    "open_manipulator_x_space",
+    "koch_space",
+    "koch_leads",
+    "op3_space",
+)  # no joint can be omitted
 EXAMPLES = sorted(path for path in ROBOTS.glob("*.yaml") if not path.stem.startswith(ALONE))
 READS = frozenset((0x82, 0x8A, 0x92))  # sync read, fast sync read, bulk read
 

@@ -68,6 +68,7 @@ _PACKAGES = {
     "dxlrun_hand": ("setup", "calibrate", "teach"),
     "dxlrun_import": ("import",),
     "dxlrun_lab": ("replay", "convert", "bench", "latency", "characterize", "experiment", "identify"),
+    "dxlrun_space": ("reach",),
     "dxlrun_teleop": ("teleop",),
     "dxlrun_view": ("view",),
 }

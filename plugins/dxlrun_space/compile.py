@@ -1,0 +1,92 @@
+"""Check of the section `tip_poses`: the joints of each pose, or the reason why there are none."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import msgspec
+from pydantic import ValidationError
+
+from dxlrun.tooling.features import Compilation, CompileStage, Contribution, Row
+from dxlrun_space import form
+from dxlrun_space.chain import IDENTITY, Chain, Pose, WrongChain
+from dxlrun_space.path import MotionLimits, NoPath, Path, Planning, plan_joints
+from dxlrun_space.reach import dexterity
+from dxlrun_space.solver import Solver
+from dxlrun_space.space_goals import PoseCommand, flat_pose, read_pose
+
+_GOAL: Final = {"x", "y", "z", "rpy", "quaternion"}
+_BASE: Final[Pose] = (IDENTITY, (0.0, 0.0, 0.0))
+_FULL: Final = 6
+"""Number of joints that can have every orientation."""
+
+
+def compile_tip_poses(compilation: Compilation) -> Contribution:
+    """Return the joints of each pose, and the rows of the poses' table."""
+    file, poses, rows = compilation.file, dict[str, dict[str, float]](), list[Row]()
+    for name, pose in form.STAGE.section_of(file.robot).items():
+        try:
+            if (found := _solved(compilation, pose)) is not None:
+                poses[name] = found["joints"]
+                rows.append({"name": name, "tip": pose.tip, **found})
+        except WrongChain as wrong:
+            file.error(file.at("tip_poses", name, wrong.key), f"{name}: {wrong.what}", wrong.fix)
+    return Contribution(poses=poses, plan=msgspec.json.encode(rows))
+
+
+def _solved(compilation: Compilation, pose: form.TipPose) -> Row | None:
+    """Return the row of a pose with its joints; None if the URDF or a joint has an error already."""
+    file, body = compilation.file, compilation.body
+    if body is None:
+        if file.robot.model is None:
+            raise WrongChain("tip", "the robot file names no URDF", "write `model: {urdf: NAME.urdf}`")
+        return None
+    chain = Chain(body.urdf, pose.base, pose.tip)
+    for joint in chain.joints:
+        if joint not in file.robot.joints:
+            raise WrongChain("tip", f"{joint} moves {pose.tip}, but has no servo", f"add {joint} to `joints`")
+    for joint in pose.near:
+        if joint not in chain.joints:
+            raise WrongChain("near", f"{joint} does not move {pose.tip}", f"write {', '.join(chain.joints)}")
+    plans = [compilation.joints[joint].plan for joint in chain.joints if joint in compilation.joints]
+    if len(plans) < len(chain.joints):
+        return None
+    near = [pose.near.get(joint) for joint in chain.joints]
+    solver = Solver(chain, [plan.lower for plan in plans], [plan.upper for plan in plans], near)
+    start = tuple(each or 0.0 for each in near)
+    try:
+        goal = read_pose(flat_pose(PoseCommand.model_validate(pose.model_dump(include=_GOAL))))
+    except ValidationError as error:
+        what, _, fix = error.errors()[0]["msg"].removeprefix("Value error, ").partition("; ")
+        raise WrongChain("", what, fix or "remove the others") from None
+    exact = goal.asks_orientation and len(plans) >= _FULL
+    target = goal.target(_BASE, chain.pose(start))
+    any_speed = (1.0,) * len(plans)
+    path = _finished(
+        plan_joints(solver, start, target, MotionLimits(any_speed, any_speed, 1, 1, 1, 1), exact=exact)
+    )
+    if isinstance(path, NoPath):
+        raise WrongChain("", path.text, "move the pose, or give it another orientation")
+    ends = zip(path.last, solver.lower, solver.upper, strict=True)
+    margins = [min(at - low, high - at) for at, low, high in ends]
+    least = margins.index(min(margins))
+    return {
+        "joints": dict(zip(chain.joints, path.last, strict=True)),
+        "orientation_error": path.residual.orientation if goal.asks_orientation else 0.0,
+        "dexterity": dexterity(chain, [path.last])[0],
+        "margin": margins[least],
+        "margin_joint": chain.joints[least],
+        "margin_unit": plans[least].unit.si,
+    }
+
+
+def _finished(planning: Planning) -> Path | NoPath:
+    while True:
+        try:
+            next(planning)
+        except StopIteration as done:
+            found: Path | NoPath = done.value
+            return found
+
+
+STAGE = CompileStage(compile_tip_poses)

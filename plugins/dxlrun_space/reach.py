@@ -1,0 +1,87 @@
+"""`dxlrun reach`: a picture of the places that a link gets to."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from dxlrun import Floats, InputError
+from dxlrun.tooling.output import check_target, show_parts, write_target
+from dxlrun.tooling.robots import read_urdf
+from dxlrun.tooling.verbs import Assignment, RobotPath, compiled, missing_extra
+from dxlrun_space.chain import Chain, WrongChain
+
+POSTURES: Final = 20_000
+
+
+def draw_reach(robot: RobotPath, tip: str, picture: Path, /, *assignments: Assignment, base: str = "") -> int:
+    """Draw where a link gets to, from the side and from above, and how easily it moves there.
+
+    Parameters
+    ----------
+    tip
+        Link of the URDF.
+    picture
+        Output file: NAME.png or NAME.svg.
+    base
+        Link in whose axes places are. Default: the root.
+    """
+    if picture.suffix not in {".png", ".svg"}:
+        raise InputError(f"{picture} is not a name for a picture; end it in .png or .svg")
+    check_target(picture)
+    if missing := missing_extra("a picture", "report", "matplotlib"):
+        raise InputError(missing)
+    plan = compiled(robot, assignments, (), None).plan
+    limits = {joint.name: (joint.lower, joint.upper) for joint in plan.loop.joints}
+    try:
+        if plan.urdf is None:
+            raise WrongChain("", f"{robot} names no URDF", "write `model: {urdf: NAME.urdf}`")
+        chain = Chain(read_urdf(plan.urdf), base, tip)
+        if missed := [joint for joint in chain.joints if joint not in limits]:
+            raise WrongChain("", f"{missed[0]} moves {tip}, but has no servo", f"add {missed[0]} to `joints`")
+    except WrongChain as wrong:
+        raise InputError(str(wrong)) from None
+    lower, upper = np.clip([limits[joint] for joint in chain.joints], -np.pi, np.pi).T
+    postures = np.random.default_rng(0).uniform(lower, upper, (POSTURES, len(lower))).tolist()
+    places = np.array([chain.pose(posture)[1] for posture in postures]) * 1e3
+    write_target(
+        picture, _drawn(places, dexterity(chain, postures), f"{tip} of {plan.robot}", picture.suffix[1:])
+    )
+    ends = zip("xyz", places.min(axis=0), places.max(axis=0), strict=True)
+    show_parts(
+        f"{tip}: {', '.join(f'{axis} {low:.0f}..{high:.0f} mm' for axis, low, high in ends)}; {picture}"
+    )
+    return 0
+
+
+def dexterity(chain: Chain, postures: Iterable[Sequence[float]]) -> list[float]:
+    """Return the dexterity of the tip at joint positions: 1 in all directions alike, 0 singular.
+
+    This is the inverse condition number of the Jacobian of the tip's place (J. K. Salisbury and J. J. Craig,
+    "Articulated hands: force control and kinematic issues", 1982).
+    """
+    columns = []
+    for posture in postures:
+        chain.pose(posture)
+        columns.append([column[:3] for column in chain.jacobian()])
+    speeds = np.linalg.svd(np.array(columns), compute_uv=False)
+    found: list[float] = (speeds[:, -1] / np.maximum(speeds[:, 0], 1e-12)).tolist()
+    return found
+
+
+def _drawn(places: Floats, colours: Sequence[float], title: str, form: str) -> bytes:
+    from matplotlib.figure import Figure
+
+    figure, content = Figure(figsize=(9, 4.2), layout="constrained"), io.BytesIO()
+    figure.suptitle(title)
+    both = figure.subplots(1, 2)
+    for axes, name, y in zip(both, "zy", (places[:, 2], places[:, 1]), strict=True):
+        cells = axes.hexbin(places[:, 0], y, colours, reduce_C_function=np.max, gridsize=45, vmin=0, vmax=1)
+        axes.set(xlabel="x, mm", ylabel=f"{name}, mm", aspect="equal")
+    figure.colorbar(cells, ax=both, label="best dexterity", shrink=0.8)
+    figure.savefig(content, format=form, dpi=110)
+    return content.getvalue()

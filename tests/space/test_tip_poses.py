@@ -1,0 +1,127 @@
+"""Poses of tips in the robot file, in motions and from Python, judged by our own forward kinematics."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tests.kit.commands import Dxlrun
+from tests.kit.judged_arms import Arm, example, turn
+
+from dxlrun import DxlrunError, RemoteRobot
+from dxlrun.compile.robot_compiler import compile_files
+from dxlrun.testing import plan_of
+from dxlrun.tooling.runs import VirtualLink
+from dxlrun_space import space_robot
+from dxlrun_space.space_robot import PoseRefused, SpaceRobot
+
+ROBOTS = Path(__file__).parents[2] / "robots"
+FOLLOWER = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll")
+RIGHT = ("r_sho_pitch", "r_sho_roll", "r_el")
+
+
+def arm_of(name: str) -> Arm:
+    """Return the arm of a robot whose poses are judged; its base is the root."""
+    base, tip, *joints = {
+        "koch_space": ("desk", "follower_hand", *FOLLOWER),
+        "op3_space": ("body_link", "r_hand", *RIGHT),
+        "open_manipulator_x_space": ("link1", "end_effector_link", "joint1", "joint2", "joint3", "joint4"),
+    }[name]
+    return example(name, base, tip, *joints)
+
+
+@pytest.mark.parametrize("name", ["koch_space", "op3_space", "open_manipulator_x_space"])
+def test_joints_of_each_pose_have_it_and_its_row_is_true(name: str) -> None:
+    compiled, arm = compile_files(ROBOTS / f"{name}.yaml", {}, []), arm_of(name)
+    rows = compiled.report["tip_poses"]
+    assert [row["name"] for row in rows] == [*compiled.plan.poses] != []
+    for row in rows:
+        at = [compiled.plan.poses[row["name"]][joint] for joint in arm.joints]
+        written = SECTION[name][row["name"]]
+        matrix = arm.matrix(at)
+        assert matrix[:3, 3] == pytest.approx(np.array(written[:3]) / 100, abs=1e-4)
+        assert arm.within(at)
+        if len(written) > 3:
+            roll, pitch, yaw = map(math.radians, written[3:])
+            asked = turn((0, 0, 1), yaw) @ turn((0, 1, 0), pitch) @ turn((1, 0, 0), roll)
+            cosine = (np.trace(asked.T @ matrix[:3, :3]) - 1) / 2
+            assert math.acos(min(1.0, cosine)) == pytest.approx(row["orientation_error"], abs=1e-3)
+        margins = [min(x - low, high - x) for x, low, high in zip(at, arm.lower, arm.upper, strict=True)]
+        assert (row["margin"], row["margin_joint"]) == (min(margins), arm.joints[np.argmin(margins)])
+        steps = np.eye(len(at)) * 1e-6
+        columns = [(arm.matrix(at + step) - arm.matrix(at - step))[:3, 3] / 2e-6 for step in steps]
+        speeds = np.linalg.svd(np.array(columns).T, compute_uv=False)
+        assert row["dexterity"] == pytest.approx(speeds[-1] / speeds[0], abs=1e-5)
+
+
+SECTION = {
+    "koch_space": {"above": (18, -12, 12, 0, -60, 180), "at_cube": (18, -10, 6, 0, -60, 180)},
+    "op3_space": {"right_forward": (14, -10, 10), "right_up": (8, -14, 20), "right_out": (6, -22, 16)},
+    "open_manipulator_x_space": {"above": (20, 0, 15, 0, 60, 0), "at_cube": (20, 0, 6, 0, 60, 0)},
+}
+"""Poses of the robot files, cm and deg."""
+
+
+def robot_of(name: str, kind: type[RemoteRobot] = RemoteRobot) -> Any:
+    return kind(name, VirtualLink(plan_of(ROBOTS / f"{name}.yaml")))
+
+
+def tip(robot: RemoteRobot) -> Any:
+    """Return the measured place of the tip, cm."""
+    measured = dict(zip(robot.states().joints, robot.states().position.tolist(), strict=True))
+    arm = arm_of(robot.name)
+    return arm.matrix([measured[joint] for joint in arm.joints])[:3, 3] * 100
+
+
+def test_motion_file_and_keyframes_lead_the_tip_to_poses(tmp_path: Path) -> None:
+    op3 = robot_of("op3_space")
+    done = op3.play(ROBOTS / "motions/op3_space_wave.yaml")
+    assert op3.wait(done.goal).status == "reached"
+    assert tip(op3) == pytest.approx(SECTION["op3_space"]["right_forward"], abs=0.3)
+    wrong = tmp_path / "wrong.yaml"
+    points = "[{time: 1 s, pose: right_upp}]"
+    wrong.write_text(f"name: wrong\nmotions:\n  - {{controller: right_hand, points: {points}}}\n")
+    with pytest.raises(DxlrunError, match="the robot has no pose right_upp; did you mean right_up"):
+        op3.play(wrong)
+    koch = robot_of("koch_space")
+    koch.switch(activate=["moves"], deactivate=["hand"])
+    assert koch.send("moves", "play", {"motion": "pick"}).goal.wait().status == "reached"
+    assert tip(koch) == pytest.approx(SECTION["koch_space"]["above"][:3], abs=0.3)
+
+
+def test_move_to_waits_for_the_pose_and_raises_what_refused_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(space_robot.dxlrun, "connect", lambda *_: robot_of("open_manipulator_x_space"))
+    with space_robot.connect() as robot:
+        assert robot.move_to(x=0.2, y=0, z="15 cm", rpy=[0, "60 deg", 0], path="joints").reached
+        assert tip(robot) == pytest.approx((20, 0, 15), abs=0.3)
+        before = robot.states().position.tolist()
+        with pytest.raises(PoseRefused, match=r"out of reach; the nearest is \d+\.\d mm away") as refused:
+            robot.move_to("arm", x=0.9)
+        assert refused.value.code == "aborted"
+        assert robot.states().position.tolist() == pytest.approx(before, abs=2e-3)
+        assert robot.move_to(dz=-0.03, seconds=2.0).seconds == pytest.approx(2.0, abs=0.3)
+        with pytest.raises(DxlrunError, match="gripper"):
+            robot.move_to("gripper", dz=0.01)
+    with pytest.raises(DxlrunError, match=r"bioloid_torso has 0 arms \(\); name one"):
+        robot_of("bioloid_torso", SpaceRobot).move_to(dz=0.01)
+
+
+@pytest.mark.needs("report")
+def test_reach_draws_what_a_link_gets_to(dxlrun: Dxlrun, tmp_path: Path) -> None:
+    file, picture = ROBOTS / "koch_space.yaml", tmp_path / "reach.png"
+    said = dxlrun("reach", file, "follower_hand", picture)
+    assert (said.code, said.err) == (0, "")
+    assert said.out.startswith("follower_hand: x -2")
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    for words, text in [
+        ((file, "hand", tmp_path / "a.png"), "tip hand is not a link of the URDF"),
+        ((file, "follower_hand", tmp_path / "a.pdf"), "end it in .png or .svg"),
+        ((ROBOTS / "leader_follower.yaml", "hand", tmp_path / "a.svg"), "names no URDF"),
+        ((file, "follower_hand", picture), "it exists"),
+    ]:
+        said = dxlrun("reach", *words)
+        assert said.code == 2
+        assert text in said.err
