@@ -37,8 +37,8 @@ def convert(content: FileContent, options: ImportOptions) -> Conversion:
                 what = f"a position of ID {number} is above 1023, so it is not an AX servo"
                 raise refused(page.mark, what, BY_HAND)
         joint = JointDraft(f"joint_{number}", number, content.mark(), "AX-12A")
-        if not _varies(number, used):
-            joint = joint._replace(registers=_slopes(number, used[:1], draft))
+        if not varies(number, used):
+            joint = joint._replace(registers=slopes_of(number, used[:1], draft))
         draft.add_joint(joint._replace(comment="guessed: name, model, direction"))
     for page in used:
         name = valid_name(page.title) if page.title else f"page_{page.number}"
@@ -53,8 +53,8 @@ def convert(content: FileContent, options: ImportOptions) -> Conversion:
         before = [
             one for one in used if page in (one.follower, one.exit) or (one is page and page.param[2] > 1)
         ]
-        slopes = {one: _slopes(one, [page], draft, usual=True) for one in ids if _varies(one, used)}
-        lines += _motion(page, ids, [one.steps[-1] for one in before], slopes, draft)
+        slopes = {one: slopes_of(one, [page], draft, usual=True) for one in ids if varies(one, used)}
+        lines += motion_lines(page, ids, [one.steps[-1] for one in before], slopes, draft)
     draft.controllers = lines
     return draft.conversion()
 
@@ -75,12 +75,12 @@ def _set_exit(page: MotionPage, leaves: MotionPage | None, draft: RobotDraft) ->
         draft.remarks.append(f"page {page.name}: its exit page {int(page.param[1])}, which leads back to it")
 
 
-def _varies(number: int, used: Sequence[MotionPage]) -> bool:
+def varies(number: int, used: Sequence[MotionPage]) -> bool:
     """Return True if pages have different compliances of a joint. Each page then sets its own."""
     return len({page.compliance_of(number) for page in used}) > 1
 
 
-def _slopes(
+def slopes_of(
     number: int, pages: Sequence[MotionPage], draft: RobotDraft, usual: bool = False
 ) -> dict[str, int]:
     """Return the registers for the compliance of a joint in a page; for the usual one only with `usual`."""
@@ -93,14 +93,25 @@ def _slopes(
     return dict.fromkeys(("cw_compliance_slope", "ccw_compliance_slope"), 1 << int(found))
 
 
-def _motion(
+def motion_lines(
     page: MotionPage,
     ids: Sequence[int],
     starts: list[list[float]],
     slopes: Mapping[int, Mapping[str, int]],
     draft: RobotDraft,
+    *,
+    fastest: float = SPEED_DEG,
 ) -> Iterator[str]:
-    """Yield the lines of a page; `starts` are the poses from which it is reached, `slopes` its registers."""
+    """Yield the lines of a page.
+
+    Args:
+        page: The page.
+        ids: IDs of the servos.
+        starts: Poses from which it is reached.
+        slopes: Registers of its first step, by ID.
+        draft: Collects the remarks.
+        fastest: Highest mean speed of the servos, deg/s.
+    """
     _, _, repeat, speed, _ = page.param
     if speed <= 0:
         raise refused(page.mark, f"page {page.name} has speed {speed:g}", "give it a speed above 0")
@@ -115,9 +126,9 @@ def _motion(
         moved = [one for one in ids if step[one] < _UNMOVED]
         pose = [f"joint_{one}: {round((step[one] - MIDDLE) * STEP_DEG, 2) + 0.0:g} deg" for one in moved]
         ways = [abs(step[one] - start[one]) for start in starts for one in moved if start[one] < _UNMOVED]
-        least = max(SHORTEST_S, math.ceil(max(ways, default=0) * STEP_DEG * speed / SPEED_DEG * 1000) / 1000)
+        least = max(SHORTEST_S, math.ceil(max(ways, default=0) * STEP_DEG * speed / fastest * 1000) / 1000)
         if step[-1] < least:
-            remarks.append(f"step {index} takes {least:g} s instead of {step[-1]:g} s, as fast as AX servos")
+            remarks.append(f"step {index} takes {least:g} s instead of {step[-1]:g} s, as fast as its servos")
         start = f"          - {{time: {max(step[-1], least):g} s, pause: {step[-2]:g} s, pose: {{"
         registers = [
             f"joint_{one}: {{{', '.join(f'{item}: {value}' for item, value in written.items())}}}"

@@ -190,11 +190,6 @@ LAST = (
     FileFormat(
         "a model of Gazebo (SDF): a body without servos", lambda content: content.top == "sdf", _DRAFT
     ),
-    FileFormat(
-        "a motion file of R+ Motion (.mtnx)",
-        lambda content: content.top == "Root" and content.xml.get("type") == "motion",
-        _PAGES,
-    ),
     FileFormat("XML", lambda content: bool(content.top), f"give a robot file in YAML; {_DRAFT}"),
     FileFormat(
         _LEROBOT,
