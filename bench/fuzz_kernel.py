@@ -151,7 +151,7 @@ class Line(OwnProcessors):
 class LinePorts:
     """Some lines, waited for together."""
 
-    polling = descriptors = None
+    polling = descriptors = functions = None
 
     def __init__(self, plans):
         self.clock = VirtualClock(1_000_000)

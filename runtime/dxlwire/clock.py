@@ -5,8 +5,11 @@ from __future__ import annotations
 import heapq
 import itertools
 import time
+from array import array
 from collections.abc import Callable
 from typing import Protocol
+
+NEVER_NS = 1 << 62
 
 
 class Clock(Protocol):
@@ -53,28 +56,39 @@ class MonotonicClock:
 class VirtualClock:
     """Simulated clock that advances only in `wait_until`; two runs from one seed have the same times."""
 
-    __slots__ = ("_calls", "_now_ns", "_order")
+    __slots__ = ("_calls", "_order", "_overridden", "state")
 
     def __init__(self, start_ns: int = 0) -> None:
-        self._now_ns = start_ns
+        self._overridden = type(self).wait_until is not VirtualClock.wait_until
+        self.state = array("q", (start_ns, 0 if self._overridden else NEVER_NS))
+        """For compiled code: the time, which it may advance up to the second number, that of the next
+        scheduled call."""
         self._calls: list[tuple[int, int, Callable[[], None]]] = []
         self._order = itertools.count()
 
     def now_ns(self) -> int:
         """Return virtual time, ns."""
-        return self._now_ns
+        return self.state[0]
 
     def wait_until(self, deadline_ns: int) -> int:
         """Advance virtual time to the deadline if it is in the future, and make the scheduled calls that
         are due; return the time, ns."""
+        state = self.state
         while self._calls and self._calls[0][0] <= deadline_ns:
             due_ns, _, action = heapq.heappop(self._calls)
-            self._now_ns = max(self._now_ns, due_ns)
+            self._note_next_call()
+            state[0] = max(state[0], due_ns)
             action()
-        self._now_ns = max(self._now_ns, deadline_ns)
-        return self._now_ns
+        state[0] = max(state[0], deadline_ns)
+        return state[0]
+
+    def _note_next_call(self) -> None:
+        """Note until when compiled code may advance the time; never if a subclass waits in another way."""
+        if not self._overridden:
+            self.state[1] = self._calls[0][0] if self._calls else NEVER_NS
 
     def call_at(self, t_ns: int, action: Callable[[], None]) -> None:
         """Schedule a call at a virtual time, ns, even in the middle of a wait. The action itself must not
         wait."""
         heapq.heappush(self._calls, (t_ns, next(self._order), action))
+        self._note_next_call()

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 import yaml
 from tests.kit.answers import result_of
+from tests.kit.bus_ports import BusPorts
 from tests.kit.commands import Dxlrun
 from tests.kit.mixed_line import MixedBus
 from tests.kit.rigs import VirtualLine
@@ -19,7 +20,6 @@ from dxlrun.cli.tools.scan import scan
 from dxlrun.dynamixel.tools import tool_port
 from dxlrun.log.log_reader import read_log
 from dxlsim.simulation_plan import BusConfig, ServoConfig
-from dxlsim.virtual_ports import VirtualPorts
 from dxlwire.packets import PacketKind
 
 NARROW = ("--baud", "1000000", "--ids", "1-4")
@@ -90,7 +90,7 @@ def test_both_protocols_are_found_on_one_line_with_a_warning(
     """A status of the XL430, at -16 ticks, is the beginning of 258 bytes for the AX-12A."""
     line: Any = VirtualLine(rate=1_000_000)
     line.bus = MixedBus([ServoConfig(1, "AX-12A", 2.0), ServoConfig(2, "XL430-W250", 2.0)], line.ledger)
-    line.ports, line.other_rates = VirtualPorts(line.clock, [line.bus]), {}
+    line.ports, line.other_rates = BusPorts(line.clock, [line.bus]), {}
     line.bus.servo(2).registers.show_live({"present_position": lambda: -16})
     monkeypatch.setattr(tool_port, "TunablePort", lambda path: line)
     assert scan("/dev/ttyUSB0", baud=(1_000_000,), ids="1-8", as_json=True) == 0

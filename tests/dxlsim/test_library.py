@@ -31,7 +31,7 @@ BLOCKS = re.findall(r"```python\n(.*?)```", (ROOM / "README.md").read_text(), re
 MODULES = [
     one.name
     for one in pkgutil.walk_packages([str(ROOM)], "dxlsim.")
-    if not {"__main__", "libline"} & {*one.name.split(".")}
+    if not one.name.rpartition(".")[2].startswith(("__main__", "lib"))  # compiled objects are no modules
 ]
 PING_1 = bytes.fromhex("ff ff fd 00 01 03 00 01 19 4e")
 

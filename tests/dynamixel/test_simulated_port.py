@@ -15,11 +15,11 @@ from dxlrun.channels.heartbeat import (
     create_progress,
 )
 from dxlrun.run.guardian import make_ports
-from dxlsim.serving.host import ENDLESS_NS
 from dxlwire.bus_plan import SIMULATED
 from dxlwire.port.ports import LONGEST_STALL_NS, SerialPort, SimulatedPort, StallCounter
 
 MS = 1_000_000
+ENDLESS_NS = 1 << 62  # nothing is due to the host
 SENT = 1_000 * MS  # when the request is off the wire
 DEADLINE = SENT + 12 * MS
 
@@ -35,6 +35,18 @@ def memory() -> Iterator[int]:
 def simulation(memory: int) -> LineProgress:
     """The simulation's side of a line."""
     return SimulationProgress(memory).line(1)
+
+
+def publish_received(line: LineProgress, off_wire_ns: int) -> None:
+    line.words[0] = off_wire_ns
+
+
+def publish_served(line: LineProgress, until_ns: int) -> None:
+    line.words[1] = until_ns
+
+
+def publish_delivery(line: LineProgress, due_ns: int, now_ns: int) -> None:
+    line.words[3], line.words[2] = due_ns, now_ns
 
 
 @pytest.fixture
@@ -55,16 +67,16 @@ def extended(port: SerialPort, now: int, heard: int = 0) -> int:
 
 
 def test_request_that_was_not_taken_is_awaited(port, simulation):
-    simulation.publish_received(SENT - 1)
-    simulation.publish_served(ENDLESS_NS)
+    publish_received(simulation, SENT - 1)
+    publish_served(simulation, ENDLESS_NS)
     assert extended(port, DEADLINE) == DEADLINE + MS
 
 
 def test_deadline_counts_from_when_the_request_was_taken(port, simulation):
-    simulation.publish_served(SENT + 100 * MS)
-    simulation.publish_received(SENT + 100 * MS)
+    publish_served(simulation, SENT + 100 * MS)
+    publish_received(simulation, SENT + 100 * MS)
     assert extended(port, SENT + 101 * MS) > SENT + 101 * MS
-    simulation.publish_served(ENDLESS_NS)  # nothing is due any more: the servo is silent on purpose
+    publish_served(simulation, ENDLESS_NS)  # nothing is due any more: the servo is silent on purpose
     assert extended(port, SENT + 102 * MS) <= SENT + 102 * MS
 
 
@@ -73,37 +85,37 @@ def test_each_simulated_bus_has_its_own_progress(memory, simulation, stalls):
     buses: Any = [SimpleNamespace(port=SIMULATED)] * 2
     lines: Any = SimpleNamespace(simulation=memory)
     first, second = make_ports(buses, ("one", "two"), (ours, theirs), lines, stalls)
-    simulation.publish_served(ENDLESS_NS)
-    simulation.publish_received(SENT + MS // 10)
+    publish_served(simulation, ENDLESS_NS)
+    publish_received(simulation, SENT + MS // 10)
     assert extended(second, DEADLINE) <= DEADLINE < extended(first, DEADLINE)
     os.close(ours)
     os.close(theirs)
 
 
 def test_silent_servo_of_a_running_process_is_given_up_at_once(port, simulation, stalls):
-    simulation.publish_served(ENDLESS_NS)
-    simulation.publish_received(SENT + MS // 10)
+    publish_served(simulation, ENDLESS_NS)
+    publish_received(simulation, SENT + MS // 10)
     assert extended(port, DEADLINE) <= DEADLINE
     assert (stalls.times, stalls.waited_ns) == (0, 0)
 
 
 def test_reply_that_is_late_on_purpose_is_given_up_at_once(port, simulation):
     """A latency timer of 16 ms: the process sleeps until the reply is due, which is behind the deadline."""
-    simulation.publish_served(SENT + 16 * MS)
-    simulation.publish_received(SENT)
+    publish_served(simulation, SENT + 16 * MS)
+    publish_received(simulation, SENT)
     assert extended(port, DEADLINE) <= DEADLINE
 
 
 def test_reply_that_was_due_and_was_not_handed_over_is_awaited(port, simulation):
-    simulation.publish_served(SENT + MS)  # when the reply is due; the process has not run since
-    simulation.publish_received(SENT)
+    publish_served(simulation, SENT + MS)  # when the reply is due; the process has not run since
+    publish_received(simulation, SENT)
     assert extended(port, DEADLINE) > DEADLINE
 
 
 def test_bytes_that_the_kernel_still_has_are_awaited(port, simulation):
-    simulation.publish_received(SENT)
-    simulation.publish_delivery(SENT + MS, SENT + 11 * MS)
-    simulation.publish_served(ENDLESS_NS)
+    publish_received(simulation, SENT)
+    publish_delivery(simulation, SENT + MS, SENT + 11 * MS)
+    publish_served(simulation, ENDLESS_NS)
     assert extended(port, DEADLINE, heard=SENT - MS) > DEADLINE
     assert extended(port, DEADLINE, heard=SENT + 11 * MS) <= DEADLINE
 
@@ -114,7 +126,7 @@ def test_wait_is_bounded_and_not_repeated_for_the_same_stall(port, simulation):
     assert extended(port, late) <= late
     later, sent = late + 100 * MS, late + 80 * MS
     assert port.extend_deadline(sent + 12 * MS, sent, 0, later) <= later
-    simulation.publish_received(late)  # the process runs again
+    publish_received(simulation, late)  # the process runs again
     assert port.extend_deadline(sent + 12 * MS, sent, 0, later) > later
 
 
@@ -136,8 +148,8 @@ def test_real_port_never_extends_a_deadline(port):
 
 
 def test_late_reply_is_split_into_what_its_process_was_late(port, simulation):
-    simulation.publish_received(SENT + 5 * MS)
-    simulation.publish_delivery(SENT + 6 * MS, SENT + 9 * MS)
+    publish_received(simulation, SENT + 5 * MS)
+    publish_delivery(simulation, SENT + 6 * MS, SENT + 9 * MS)
     assert port.late_ns(SENT, SENT + 10 * MS) == (5 + 4) * MS
 
 
@@ -151,5 +163,5 @@ def test_stalls_count_as_far_as_they_overlap(memory, port):
 
 
 def test_port_of_a_line_that_is_back_keeps_its_progress(port, simulation):
-    simulation.publish_received(SENT - 1)
+    publish_received(simulation, SENT - 1)
     assert extended(port.renewed(), DEADLINE) > DEADLINE

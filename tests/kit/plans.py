@@ -30,7 +30,7 @@ def distinct_tables() -> list[ControlTable]:
 class ScriptedLine(OwnProcessors):
     """Port and Ports in one: after the n-th write it says what the script has, at times since that write."""
 
-    polling = descriptors = None
+    polling = descriptors = functions = None
 
     def __init__(self, *script: Sequence[tuple[int, bytes]]) -> None:
         self.clock = VirtualClock(1_000)

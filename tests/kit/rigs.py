@@ -25,6 +25,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 from numpy.typing import NDArray
+from tests.kit.bus_ports import BusPorts
 from tests.kit.decoded import decode_packets
 from tests.kit.line_faults import corrupt_next, truncate_next
 from tests.kit.plans import make_plan
@@ -42,7 +43,6 @@ from dxlsim.bus.ledger import Ledger
 from dxlsim.bus.simulated_bus import SimulatedBus
 from dxlsim.servo.simulated_servo import SimulatedServo
 from dxlsim.simulation_plan import AdapterConfig, BusConfig, ServoConfig
-from dxlsim.virtual_ports import VirtualPorts
 from dxlwire.bus_plan import BusPlan
 from dxlwire.clock import VirtualClock
 from dxlwire.exchange.bus_engine import Lines
@@ -98,7 +98,7 @@ class Rig:
     ledger: Ledger
     clock: VirtualClock
     buses: Sequence[SimulatedBus]
-    ports: VirtualPorts
+    ports: BusPorts
     states: States
     goals: Commands
     packets: Packets
@@ -252,7 +252,7 @@ class VirtualLine:
         self.clock, self.ledger = VirtualClock(1_000_000), Ledger()
         config = BusConfig("main", rate, servos, protocol, adapter=adapter or AdapterConfig())
         self.bus = SimulatedBus(config, self.ledger, 0)
-        self.ports = VirtualPorts(self.clock, [self.bus])
+        self.ports = BusPorts(self.clock, [self.bus])
 
     def receive_bytes(self, until_ns: int) -> bytes:
         self.ports.wait_for_bytes(until_ns)
@@ -325,7 +325,7 @@ def make_rig(
         servos += [ServoConfig(one.servo_id, one.model, 2.0, delay_ns) for one in plan.devices]
         config = BusConfig(plan.name, plan.baud_rate, (*servos, *extra), plan.protocol)
         buses.append(SimulatedBus(config, ledger, clock.now_ns()))
-    ports = VirtualPorts(clock, buses)
+    ports = BusPorts(clock, buses)
     rows = sum(len(plan.servos) for plan in plans)
     states, goals, packets, events = States.empty(rows), Commands.empty(rows), Packets(), Events()
     devices = [device for plan in plans for device in plan.devices]

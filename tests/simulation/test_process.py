@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
 import select
 import signal
@@ -19,9 +20,9 @@ from tests.kit.bus_process import BusProcess, launch, opened, receive
 from dxlsim.bus.ledger import Ledger
 from dxlsim.bus.simulated_bus import SimulatedBus
 from dxlsim.serving.pseudo_terminal import DeviceLink, PseudoTerminal
-from dxlsim.serving.realtime_serving import PollBudget
-from dxlsim.serving.simulation_server import _WRITTEN, lateness_us
+from dxlsim.serving.simulation_server import lateness_us
 from dxlsim.simulation_plan import BusConfig, ServoConfig, SimulationConfig
+from dxlsim.wire.compiled_line import NEVER_NS, PollBudget, line_library
 
 PING_1 = bytes.fromhex("ff ff 01 02 01 fb")
 PONG_1 = bytes.fromhex("ff ff 01 02 00 fc")
@@ -272,7 +273,7 @@ def test_what_a_host_wrote_to_an_unplugged_terminal_is_lost(terminal):
 def test_a_terminal_without_a_host_is_reported_once(terminal):
     with select.epoll() as waiting:
         with opened(terminal.path) as port:
-            waiting.register(terminal.fileno(), _WRITTEN)
+            waiting.register(terminal.fileno(), select.EPOLLIN | select.EPOLLET)
             os.write(port, PING_1)
             assert waiting.poll(DEADLINE_S) == [(terminal.fileno(), select.EPOLLIN)]
             terminal.read_chunk()
@@ -317,18 +318,21 @@ def test_what_a_host_writes_while_others_are_served_is_not_of_the_moment_before(
 
 
 def test_polling_is_bounded_and_sleeping_is_not_endless():
-    budget, now, polled = PollBudget(0), 0, 0
+    line, now, polled = line_library(), 0, 0
+    budget = PollBudget(budget_ns=20_000_000)
+
+    def sleep_ns(due_ns: int, now_ns: int) -> int:
+        return int(line.line_sleep_ns(ctypes.byref(budget), due_ns, now_ns, NEVER_NS))
+
     for _ in range(100_000):  # something is always due in 60 us
-        wait_s = budget.sleep_s(now + 60_000, now)
-        assert wait_s is not None
-        spent = 1_000 if wait_s == 0 else round(wait_s * 1e9)
-        polled += spent if wait_s == 0 else 0
-        now += spent
-        budget.woke(now)
+        wait_ns = sleep_ns(now + 60_000, now)
+        polled += 0 if wait_ns else 1_000
+        now += wait_ns or 1_000
+        line.line_woke(ctypes.byref(budget), now)
     assert polled < now / 6 + 25_000_000
-    assert budget.sleep_s(None, now) is None
-    assert budget.sleep_s(now - 5, now + 10**9) == 0
-    assert budget.sleep_s(now + 3 * 10**9, now + 2 * 10**9) == pytest.approx(1.0, abs=1e-3)
+    assert sleep_ns(NEVER_NS, now) == NEVER_NS
+    assert sleep_ns(now - 5, now + 10**9) == 0
+    assert sleep_ns(now + 3 * 10**9, now + 2 * 10**9) == pytest.approx(10**9, abs=10**6)
 
 
 def test_a_link_never_replaces_a_file_and_is_removed_only_where_it_was_put(tmp_path):

@@ -238,48 +238,32 @@ class SimulationProgress:
 class LineProgress:
     """Progress of the process of simulated servos on one bus line, in shared memory."""
 
-    __slots__ = ("_words", "process")
+    __slots__ = ("process", "words")
 
     def __init__(self, process: SimulationProgress, words: memoryview) -> None:
         self.process = process
-        self._words = words
-
-    # The simulation's side
-
-    def publish_served(self, until_ns: int) -> None:
-        """Publish that all simulated bytes due before `until_ns` were delivered to the loop."""
-        store(self._words, _SERVED, until_ns)
-
-    def publish_received(self, off_wire_ns: int) -> None:
-        """Publish when the last byte that the simulation has executed left the wire, ns."""
-        store(self._words, _TAKEN, off_wire_ns)
-
-    def publish_delivery(self, due_ns: int, now_ns: int) -> None:
-        """Publish that bytes for the loop are delivered now, and when the newest of them were due, ns."""
-        self._words[_DUE] = due_ns
-        store(self._words, _GIVEN, now_ns)
-
-    # The host's side
+        self.words = words
+        """The numbers of the properties, which the compiled simulation publishes."""
 
     @property
     def taken_ns(self) -> int:
         """Time at which the last byte that the simulation executed left the wire, ns. Must be read first."""
-        return load(self._words, _TAKEN)
+        return load(self.words, _TAKEN)
 
     @property
     def served_ns(self) -> int:
         """Time before which all simulated bytes that are due were delivered to the loop, ns."""
-        return load(self._words, _SERVED)
+        return load(self.words, _SERVED)
 
     @property
     def given_ns(self) -> int:
         """Time of the newest delivery of simulated bytes to the loop, ns; 0: none."""
-        return load(self._words, _GIVEN)
+        return load(self.words, _GIVEN)
 
     @property
     def due_ns(self) -> int:
         """Time at which the newest delivered bytes were due, ns."""
-        return self._words[_DUE]
+        return self.words[_DUE]
 
 
 class Standstill:

@@ -83,7 +83,6 @@ class SimulatedBus:
         self.name = config.name
         self.protocol = config.protocol
         self.ledger = ledger
-        self.times_unplugged = 0
         self.servos: tuple[SimulatedServo, ...] = ()
         self.devices: tuple[SimulatedDevice, ...] = ()
         self.nodes: tuple[SimulatedNode, ...] = ()
@@ -140,6 +139,11 @@ class SimulatedBus:
     def plugged(self) -> bool:
         """False while the adapter is unplugged."""
         return bool(self._line.plugged)
+
+    @property
+    def times_unplugged(self) -> int:
+        """Number of times the adapter was unplugged."""
+        return int(self._line.unplugged)
 
     @property
     def baud_rate(self) -> int:
@@ -319,7 +323,7 @@ class SimulatedBus:
         if self.plugged:
             self.add_note("adapter unplugged")
             self._line.plugged = 0
-            self.times_unplugged += 1
+            self._line.unplugged += 1
             self._library.line_discard(self.address)
             self._library.line_discard_packet(self.address)
 
@@ -384,6 +388,7 @@ class SimulatedBus:
             Task.ALTER: self._alter,
             Task.PIECE: lambda *_: self._chance.randint(1, _LONGEST_PIECE),
             Task.LEDGER: lambda *_: self.ledger.take_entries(),
+            Task.RATE: lambda rate, _: self.change_rate(rate),
         }
         return [tasks[task] for task in Task]
 

@@ -8,9 +8,6 @@ from typing import Protocol
 
 from dxlsim.messages import SimulationMessage, SimulationRequest
 
-ENDLESS_NS = 1 << 62
-"""Argument of `LineProgress.publish_served` while nothing is due to the host."""
-
 
 class Starter(Protocol):
     """Program that started a server of simulated buses, possibly in another thread or process."""
@@ -31,14 +28,15 @@ class Starter(Protocol):
 class LineProgressReceiver(Protocol):
     """Receiver of the server's progress on one line. Times are CLOCK_MONOTONIC, ns."""
 
-    def publish_served(self, until_ns: int) -> None:
-        """Publish that all bytes due to the host before `until_ns` have been delivered."""
+    @property
+    def words(self) -> memoryview:
+        """Four numbers of 64 bits, into which compiled code publishes, each with release semantics:
 
-    def publish_received(self, off_wire_ns: int) -> None:
-        """Publish the time at which the newest byte received from the host is off the simulated wire."""
-
-    def publish_delivery(self, due_ns: int, now_ns: int) -> None:
-        """Publish that bytes which were due at `due_ns` are delivered to the host at `now_ns`."""
+        - the time at which the newest byte received from the host is off the simulated wire;
+        - the time before which all bytes due to the host have been delivered, 1 << 62 while none is due;
+        - the time at which bytes were delivered to the host last;
+        - the time at which these were due, valid once the time before it is published.
+        """
 
 
 class ServerProgressReceiver(Protocol):

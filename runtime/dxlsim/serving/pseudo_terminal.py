@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+import ctypes
 import fcntl
 import os
 import struct
-import time
 import tty
-from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
 from dxlsim.bus.simulated_bus import SimulatedBus
+from dxlsim.wire.compiled_line import TerminalState, line_library
 
 _TCGETS2, _TCSETS2 = 0x802C542A, 0x402C542B
 """Requests for terminal settings with a numeric rate (Linux, asm-generic/ioctls.h): they support every
@@ -21,8 +21,6 @@ _SETTINGS = struct.Struct("4I20s2I")
 rates."""
 _ROOM = bytes(_SETTINGS.size)
 _CBAUD, _BOTHER = 0o010017, 0o010000
-_CHUNK = 4096
-"""Size of one read, bytes; a shorter result means that no more bytes are waiting."""
 
 
 class PseudoTerminal:
@@ -36,21 +34,36 @@ class PseudoTerminal:
     (`tcflush(TCOFLUSH)`, pyserial's `reset_output_buffer`) loses the bytes that the kernel has not
     delivered yet. pypot 5.0 does so before each packet."""
 
-    def __init__(self, bus: SimulatedBus, link: DeviceLink | None = None) -> None:
+    def __init__(
+        self, bus: SimulatedBus, link: DeviceLink | None = None, progress: memoryview | None = None
+    ) -> None:
         self.bus = bus
         self._link = link
+        self._progress = None if progress is None else (ctypes.c_char * progress.nbytes).from_buffer(progress)
+        """Words in which the line's progress is published; None: nobody watches."""
         self._master, self._name = self._new_pair()
-        self._settings = b""  # Settings of the terminal at the host's last write
-        self._taken = b""  # Bytes of the host that the bus has not received yet
-        self.may_have_more = False  # True if the last read returned a full chunk
-        self._times_unplugged = bus.times_unplugged
-        self.plugged = True  # False: the adapter is unplugged and no device exists
+        self.state = TerminalState(
+            bus=bus.address,
+            progress=None if self._progress is None else ctypes.addressof(self._progress),
+            served_ns=-1,
+            descriptor=self._master,
+            opened=bus.times_unplugged,
+            plugged=1,
+        )
+        """State that compiled code uses: descriptor, settings, and bytes that the bus has not received."""
+        self._address = ctypes.addressof(self.state)
+        self._library = line_library()
         self._publish()
 
     @property
     def path(self) -> str:
         """Path of the device that hosts open; empty while the adapter is unplugged."""
         return self._name if self.plugged else ""
+
+    @property
+    def plugged(self) -> bool:
+        """False: the adapter is unplugged and no device exists."""
+        return bool(self.state.plugged)
 
     def fileno(self) -> int:
         """Return the descriptor that becomes readable when the host has written."""
@@ -61,17 +74,18 @@ class PseudoTerminal:
 
         The new device has another name, as with udev, because a host may still hold the old one; the link
         is updated. Bytes that the host wrote in between are lost."""
-        if self._times_unplugged == self.bus.times_unplugged and self.plugged == self.bus.plugged:
+        if self.state.opened == self.bus.times_unplugged and self.plugged == self.bus.plugged:
             return False
-        self._taken = b""
-        if self._times_unplugged != self.bus.times_unplugged:
-            self._times_unplugged = self.bus.times_unplugged
+        self.state.size = 0
+        if self.state.opened != self.bus.times_unplugged:
+            self.state.opened = self.bus.times_unplugged
             old = self._master
             # Opened before the old one is closed, to get another name
             self._master, self._name = self._new_pair()
             os.close(old)
+            self.state.descriptor = self._master
             self._unpublish()
-        self.plugged = self.bus.plugged
+        self.state.plugged = self.bus.plugged
         if self.plugged:
             try:
                 self._publish()
@@ -81,11 +95,7 @@ class PseudoTerminal:
 
     def read_chunk(self) -> None:
         """Read one chunk of bytes that the host has written, and keep it for `deliver_bytes`."""
-        data = b""
-        with suppress(OSError):  # No data, or no host
-            data = os.read(self._master, _CHUNK)
-        self._taken += data
-        self.may_have_more = len(data) == _CHUNK
+        self._library.line_read_chunk(self._address)
 
     def deliver_bytes(self, now_ns: int) -> int:
         """Pass the bytes that were read to the bus, as written at `now_ns`, with the host's baud rate.
@@ -93,38 +103,15 @@ class PseudoTerminal:
         Returns:
             The number of bytes.
         """
-        data, self._taken = self._taken, b""
-        if not data:
-            return 0
-        settings = _settings(self._master)
-        if settings != self._settings:  # Cheap check: the rate changes only with the settings
-            self._settings = settings
-            rate = _rate(settings)
-            if rate not in (0, self.bus.baud_rate):
-                self.bus.change_rate(rate)
-        self.bus.receive_bytes(data, now_ns)
-        return len(data)
+        count: int = self._library.line_accept(self._address, now_ns)
+        self.bus.raise_stored()
+        return count
 
-    def deliver(self, now_ns: int, announce: Callable[[int], None] | None = None) -> None:
-        """Write the bytes of the bus that are due to the host; bytes that do not fit into the terminal are
-        lost.
-
-        Args:
-            now_ns: Time up to which bytes are due.
-            announce: Called with the time before bytes are written.
-        """
-        handed_ns = time.monotonic_ns()
-        data = self.bus.drain_bytes(now_ns, handed_ns=handed_ns)
-        if not data:
-            return
-        if announce is not None:
-            announce(handed_ns)
-        try:
-            written = os.write(self._master, data)
-        except BlockingIOError:
-            written = 0
-        if written < len(data):
-            self.bus.add_note(f"{len(data) - written} bytes to the host are lost: the host does not read")
+    def deliver(self, now_ns: int) -> None:
+        """Write the bytes of the bus that are due to the host at `now_ns`; bytes that do not fit into the
+        terminal are lost."""
+        self._library.line_deliver(self._address, now_ns)
+        self.bus.raise_stored()
 
     def close(self) -> None:
         """Close the terminal and remove its link."""
@@ -188,10 +175,6 @@ class DeviceLink:
 
 def _settings(terminal: int) -> bytes:
     return fcntl.ioctl(terminal, _TCGETS2, _ROOM)
-
-
-def _rate(settings: bytes) -> int:
-    return int(_SETTINGS.unpack(settings)[-1])
 
 
 def _set_rate(terminal: int, baud_rate: int) -> None:

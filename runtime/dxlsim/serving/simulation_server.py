@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import select
 import signal
 import socket
@@ -22,36 +23,16 @@ from dxlsim.messages import ServoLook, SimulationMessage
 from dxlsim.motion.body import ShaftPublisher, ShaftSink
 from dxlsim.motion.mechanics import Mechanics, plant_of
 from dxlsim.registers.memory import Memory
-from dxlsim.serving.host import ENDLESS_NS, LineProgressReceiver, ServerProgressReceiver, Starter
+from dxlsim.serving.host import ServerProgressReceiver, Starter
 from dxlsim.serving.pseudo_terminal import DeviceLink, PseudoTerminal
-from dxlsim.serving.realtime_serving import PollBudget
 from dxlsim.simulation_plan import SimulationConfig
+from dxlsim.wire.compiled_line import NEVER_NS, STALLED, ServerState, line_library, waiting_function
 from dxlwire.exceptions import InputError
-
-MOST_BACKLOG_NS = 20_000_000
-"""Limit of the host's bytes that wait for the simulated wire, as wire time in ns; beyond it the host is not
-read.
-
-The host is thus slowed down to the rate of its line, as with an adapter."""
-
-GATHER_NS = 250_000
-"""Replies that end within this time, ns, are delivered together, as in two microframes of USB. Each
-delivery costs more processor time here and in the host than a reply."""
-
-_WRITTEN = select.EPOLLIN | select.EPOLLET
-"""Events of epoll for a terminal. Edge-triggered, to report each write of a host once: a terminal without
-a host is at end of file all the time."""
-
-LONGEST_SLEEP_NS = 10_000_000
-"""Longest sleep (ns) while a host watches the server's progress, so that a longer pause is recognized as a
-stall."""
-STALL_NS = 20_000_000
-"""Pause between two readings of the clock, ns, from which it counts as a stall, in which the process had
-no core."""
 
 IDLE_NS = 300_000  # Time reserved for a few steps of the mechanics
 
-_BITS_PER_BYTE = 10  # 8N1
+_ADAPTER, _ASKED = 1, 2  # Bits of what Python has to do after `line_serve`
+_BUDGET_NS = 20_000_000  # Time for which a server may poll at first, ns
 
 _GOAL_MODES = (3, 4, 5)
 """Values of Operating Mode (11) with a goal position: position, extended position, current-based position
@@ -103,21 +84,30 @@ class Server:
         self._faults = FaultScript([parse_fault(text) for text in config.faults], config.seed)
         self._faults.attach(self._buses, start_ns=self.start_ns)
         links = {name: DeviceLink(Path(path)) for name, path in config.links.items()}
-        self._terminals = tuple(PseudoTerminal(bus, links.get(bus.name)) for bus in self._buses)
+        self._terminals = tuple(
+            PseudoTerminal(bus, links.get(bus.name), None if progress is None else progress.line(index).words)
+            for index, bus in enumerate(self._buses)
+        )
         self._shafts = None if shafts is None else ShaftPublisher(self._mechanics, shafts)
         self._progress = progress
-        self._lines = {
-            terminal: _ServedLine(progress.line(index), terminal.bus)
-            for index, terminal in enumerate(self._terminals)
-            if progress is not None
-        }
-        self._looked_ns = self.start_ns
-        self._polling = PollBudget(self.start_ns)
         self._stopped = False
         self._waiting = select.epoll()
-        self._by_descriptor: dict[int, PseudoTerminal] = {}
-        self._held: dict[int, int] = {}
-        """Times (ns) until which terminals are not read because their hosts are too fast, by descriptor."""
+        self._stalled = STALLED(self._note_stall)
+        terminals = [ctypes.addressof(terminal.state) for terminal in self._terminals]
+        self._addresses = (ctypes.c_void_p * max(len(terminals), 1))(*terminals)
+        self._state = ServerState(
+            terminals=ctypes.addressof(self._addresses),
+            stalled=ctypes.cast(self._stalled, ctypes.c_void_p),
+            easy_ns=NEVER_NS,
+            looked_ns=self.start_ns,
+            count=len(terminals),
+            waiting=self._waiting.fileno(),
+            watched=progress is not None,
+        )
+        polling = self._state.polling
+        polling.budget_ns, polling.asked_ns, polling.woken_ns = _BUDGET_NS, self.start_ns, self.start_ns
+        self._address = ctypes.addressof(self._state)
+        self._library, self._wait = line_library(), waiting_function()
 
     def serve_ports(self, granted: str = "", stop: int = -1) -> None:
         """Report the ports and the granted real-time properties to the starter, then serve until the end.
@@ -127,10 +117,10 @@ class Server:
             stop: Descriptor that ends the server when it becomes readable; -1: none.
         """
         self._ledger.on_note = self._report_fault
-        with self._waiting as waiting:
-            if stop >= 0:
-                waiting.register(stop, select.EPOLLIN)
-            waiting.register(self._starter, select.EPOLLIN)
+        with self._waiting:
+            for other in (stop, self._starter.fileno()):
+                if other >= 0:
+                    self._library.line_watch(self._address, other)
             self._plug()
             self._tell(SimulationMessage(self._ports(), granted))
             while not self._stopped:
@@ -140,135 +130,42 @@ class Server:
         for terminal in self._terminals:
             terminal.close()
 
-    def _look_at_clock(self) -> int:
-        """Return the time, ns. If the process was stalled before, publish the stall and exclude it from
-        the servos' watchdogs."""
-        now_ns = time.monotonic_ns()
+    def _note_stall(self, begin_ns: int, end_ns: int) -> None:
+        """Publish an interval in which the process had no core, and exclude it from the servos' watchdogs."""
         if self._progress is not None:
-            since_ns, self._looked_ns = self._looked_ns, now_ns
-            if now_ns - since_ns > STALL_NS:
-                self._progress.note_stall(since_ns, now_ns)
-                for bus in self._buses:
-                    bus.excuse(now_ns - since_ns)
-        return now_ns
+            self._progress.note_stall(begin_ns, end_ns)
+        for bus in self._buses:
+            bus.excuse(end_ns - begin_ns)
 
     def _serve_once(self, stop: int) -> None:
-        now_ns = self._look_at_clock()
-        soonest_ns = self._find_next_delivery()
-        easy_ns = None
-        if soonest_ns is None or soonest_ns - now_ns > IDLE_NS:  # No reply is about to be sent
-            easy_ns = self._work_in_idle_time(now_ns)
-            now_ns = self._look_at_clock()
-        if self._lines:
-            easy_ns = min(easy_ns or ENDLESS_NS, now_ns + LONGEST_SLEEP_NS)
-        ready = self._wait(soonest_ns, easy_ns, now_ns)
-        # Replies that were due before the host wrote go out first, because the host could have read them.
-        now_ns = self._look_at_clock()
-        self._polling.woke(now_ns)
-        if soonest_ns is not None and soonest_ns <= now_ns:
+        soonest_ns, now_ns = self._library.line_find_delivery(self._address), time.monotonic_ns()
+        idle = soonest_ns - now_ns > IDLE_NS  # No reply is about to be sent
+        self._state.easy_ns = self._work_in_idle_time(now_ns) if idle else NEVER_NS
+        self._wait(self._address)
+        news = self._library.line_serve(self._address)
+        for bus in self._buses:
+            bus.raise_stored()
+        if news & _ADAPTER:
             for terminal in self._terminals:
-                due_ns = terminal.bus.next_delivery_ns(GATHER_NS)
-                if due_ns is not None and due_ns <= now_ns:
-                    self._deliver(terminal, now_ns)
-        rounds = len(self._terminals)  # A host that drives all buses writes to them in one go
-        while ready:
-            for number, _ in ready:
-                if number in self._by_descriptor:
-                    self._by_descriptor[number].read_chunk()
-            now_ns = (
-                self._look_at_clock()
-                # Read after the bytes, so that no host gets a reply before it wrote, even if other lines take
-                # long
-            )
-            for number, _ in ready:
-                self._read_ready(number, stop, now_ns)
-            rounds -= 1
-            # Edge-triggered: each event is reported only once
-            ready = self._waiting.poll(0) if rounds else []
-        self._ledger.flush_if_due(now_ns)
-
-    def _find_next_delivery(self) -> int | None:
-        """Return the time (ns) of the next delivery to any host, None without one; publish it for each
-        line."""
-        soonest_ns = None
-        for terminal in self._terminals:
-            due_ns = terminal.bus.next_delivery_ns(GATHER_NS)
-            if self._lines:
-                self._lines[terminal].publish_next_delivery(due_ns)
-            if due_ns is not None and (soonest_ns is None or due_ns < soonest_ns):
-                soonest_ns = due_ns
-        return soonest_ns
-
-    def _work_in_idle_time(self, now_ns: int) -> int | None:
-        """Step the mechanics and resume reading slowed hosts; return the time (ns) at which more such work
-        is due, None: nothing is."""
-        self._mechanics.step_to(now_ns)
-        times = [self._ledger.flush_due_ns(), self._mechanics.due_ns()]
-        if self._held:
-            for number in [each for each, until_ns in self._held.items() if until_ns <= now_ns]:
-                del self._held[number]
-                self._waiting.register(number, _WRITTEN)
-            times += self._held.values()
-        return min([t_ns for t_ns in times if t_ns is not None], default=None)
-
-    def _wait(self, due_ns: int | None, easy_ns: int | None, now_ns: int) -> list[tuple[int, int]]:
-        poll, polling = self._waiting.poll, self._polling
-        sleep_s = polling.sleep_s(due_ns, now_ns, easy_ns)
-        if sleep_s is None or sleep_s > 0.0:
-            # select has microsecond resolution, epoll alone only milliseconds
-            select.select((self._waiting,), (), (), sleep_s)
-            if (ready := poll(0)) or due_ns is None:
-                return ready
-            now_ns = time.monotonic_ns()
-            polling.woke(now_ns)
-            if polling.sleep_s(due_ns, now_ns) != 0.0:
-                return ready
-        while not (ready := poll(0)) and due_ns is not None and time.monotonic_ns() < due_ns:
-            pass
-        return ready
-
-    def _deliver(self, terminal: PseudoTerminal, now_ns: int) -> None:
-        terminal.deliver(now_ns, self._lines[terminal].publish_delivery if self._lines else None)
-        if terminal.follow_adapter():
+                terminal.follow_adapter()
             self._plug()
             self._tell(SimulationMessage(self._ports()))
+        if news & _ASKED:
+            self._answer_requests(stop)
+        self._ledger.flush_if_due(now_ns)
 
-    def _read_ready(self, number: int, stop: int, now_ns: int) -> None:
-        terminal = self._by_descriptor.get(number)
-        if terminal is not None:
-            self._receive(number, terminal, now_ns)
-        elif number == stop:
-            self._stopped = True
-        elif number == self._starter.fileno():
-            self._answer_requests(now_ns)
-
-    def _receive(self, number: int, terminal: PseudoTerminal, now_ns: int) -> None:
-        bus = terminal.bus
-        due_ns = bus.next_due_ns()
-        if due_ns is not None and due_ns <= now_ns:
-            self._deliver(terminal, now_ns)
-        if not terminal.plugged or terminal.fileno() != number:
-            return
-        count = terminal.deliver_bytes(now_ns)
-        if count and self._lines:
-            self._lines[terminal].publish_next_delivery(bus.next_delivery_ns(GATHER_NS))
-            self._lines[terminal].publish_received(count, now_ns)
-        if bus.host_free_ns - MOST_BACKLOG_NS > now_ns:
-            self._held[number] = bus.host_free_ns - MOST_BACKLOG_NS
-            self._waiting.unregister(number)
-        elif terminal.may_have_more:
-            self._waiting.modify(number, _WRITTEN)  # Makes epoll report the waiting bytes once more
+    def _work_in_idle_time(self, now_ns: int) -> int:
+        """Step the mechanics and resume reading slowed hosts; return the time (ns) at which more such work
+        is due."""
+        self._mechanics.step_to(now_ns)
+        resumed_ns: int = self._library.line_resume(self._address, now_ns)
+        times = [self._ledger.flush_due_ns(), self._mechanics.due_ns()]
+        return min([resumed_ns, *(t_ns for t_ns in times if t_ns is not None)])
 
     def _plug(self) -> None:
         """Wait for the terminals that exist now, after an adapter was unplugged or plugged in."""
-        for number in self._by_descriptor:
-            # Terminals that were unplugged or are on hold are not registered
-            with contextlib.suppress(OSError):
-                self._waiting.unregister(number)
-        self._held.clear()
-        self._by_descriptor = {each.fileno(): each for each in self._terminals if each.plugged}
-        for number in self._by_descriptor:
-            self._waiting.register(number, _WRITTEN)
+        for index in range(len(self._terminals)):
+            self._library.line_plug(self._address, index)
 
     def _ports(self) -> dict[str, str]:
         return {terminal.bus.name: terminal.path for terminal in self._terminals}
@@ -282,8 +179,14 @@ class Server:
         if select.select((), (self._starter,), (), 0)[1]:  # Writable means room for 100 KB or more
             self._starter.send_message(message)
 
-    def _answer_requests(self, now_ns: int) -> None:
+    def _answer_requests(self, stop: int) -> None:
         """Answer the new requests of the starter: states of servos, and faults to plan."""
+        starter = self._starter.fileno()
+        others = [each for each in (starter, stop) if each >= 0]
+        ready, now_ns = select.select(others, (), (), 0)[0], time.monotonic_ns()
+        self._stopped = stop in ready
+        if starter not in ready:
+            return
         for request in self._starter.receive_messages():
             if request.look:
                 looks = tuple(look for bus in self._buses for look in servo_looks(bus, now_ns))
@@ -299,40 +202,6 @@ class Server:
         except InputError as error:
             return SimulationMessage(error=str(error))
         return SimulationMessage(fault=str(fault))
-
-
-class _ServedLine:
-    """Publishes the server's progress on one line, for hosts that distinguish a late server from a silent
-    servo."""
-
-    __slots__ = ("_bus", "_progress", "_served_ns", "_taken_ns")
-
-    def __init__(self, progress: LineProgressReceiver, bus: SimulatedBus) -> None:
-        self._progress = progress
-        self._bus = bus
-        self._taken_ns = 0
-        self._served_ns = -1
-
-    def publish_next_delivery(self, due_ns: int | None) -> None:
-        """Publish that the line is served up to its next delivery to the host, at `due_ns`; None: nothing
-        is due."""
-        until_ns = ENDLESS_NS if due_ns is None else due_ns
-        if until_ns != self._served_ns:
-            self._progress.publish_served(until_ns)
-            self._served_ns = until_ns
-
-    def publish_received(self, count: int, now_ns: int) -> None:
-        """Publish that `count` bytes of the host were received, even if a fault keeps them from the servos.
-
-        Call this after `publish_next_delivery`: a host that sees the bytes as received relies on the due time
-        of the reply."""
-        duration_ns = count * _BITS_PER_BYTE * 1_000_000_000 // self._bus.baud_rate
-        self._taken_ns = max(self._taken_ns, now_ns) + duration_ns
-        self._progress.publish_received(self._taken_ns)
-
-    def publish_delivery(self, now_ns: int) -> None:
-        """Publish that bytes are delivered to the host now, with the time at which they were due."""
-        self._progress.publish_delivery(now_ns - self._bus.newest_lateness_ns, now_ns)
 
 
 @contextlib.contextmanager

@@ -18,12 +18,20 @@ from dxlwire.compiled import load_compiled, parse_structs
 
 SOURCE = Path(__file__).with_name("line.c")
 STRUCTS = parse_structs(SOURCE.read_text())
-NodeState, LineState, LedgerState, Entry, Asked = (
-    STRUCTS[name] for name in ("Node", "Line", "Ledger", "Entry", "Asked")
+NodeState, LineState, LedgerState, Entry, Asked, Port, Ports, TerminalState, ServerState, PollBudget = (
+    STRUCTS[name]
+    for name in (
+        *("Node", "Line", "Ledger", "Entry", "Asked"),
+        *("Port", "Ports", "Terminal", "Server", "PollBudget"),
+    )
 )
 _Packet, _Receiver = STRUCTS["Packet"], STRUCTS["Receiver"]
 TASK = ctypes.CFUNCTYPE(c_int64, c_int32, c_int64, c_int64)
 """Function of Python that a line calls: number of the task, two arguments; the result depends on the task."""
+ADVANCE = ctypes.CFUNCTYPE(c_int64, c_int64)
+"""Function of Python that lets a virtual clock make the calls that are due until a time, ns."""
+STALLED = ctypes.CFUNCTYPE(None, c_int64, c_int64)
+"""Function of Python that publishes an interval, ns, in which the process had no core."""
 NEVER_NS = 1 << 62  # Time of an event that does not happen
 _FAST_READS = frozenset((Instruction.FAST_SYNC_READ, Instruction.FAST_BULK_READ))
 _OVERHEAD = 16  # Bytes of a status packet without parameters, and more
@@ -51,16 +59,20 @@ class Task(IntEnum):
     ALTER = 13  # Apply a fault to an instruction
     PIECE = 14  # Draw the size of the next piece of a delivery
     LEDGER = 15  # Take the entries of the ledger
+    RATE = 16  # The host has set another baud rate
 
 
 _FUNCTIONS: dict[str, tuple[type | None, tuple[object, ...]]] = {
+    "accept": (c_int32, (c_void_p, c_int64)),
     "crc": (c_uint16, (c_char_p, c_int64, c_uint16)),
+    "deliver": (None, (c_void_p, c_int64)),
     "discard": (None, (c_void_p,)),
     "discard_packet": (None, (c_void_p,)),
     "drain": (c_int64, (c_void_p, c_int64, c_int64)),
     "execute": (None, (c_void_p, c_char_p, c_int64, c_int64)),
     "execute_altered": (None, (c_void_p, c_char_p, c_int64)),
     "feed": (c_int32, (c_void_p, c_char_p, c_int64, c_int64, c_void_p)),
+    "find_delivery": (c_int64, (c_void_p,)),
     "forget": (None, (c_void_p,)),
     "free": (None, (c_void_p,)),
     "free_ledger": (None, (c_void_p,)),
@@ -69,18 +81,30 @@ _FUNCTIONS: dict[str, tuple[type | None, tuple[object, ...]]] = {
     "new": (c_void_p, (c_int32, c_int64)),
     "next_delivery": (c_int64, (c_void_p, c_int64)),
     "next_due": (c_int64, (c_void_p,)),
+    "open_port": (None, (c_void_p, c_int32)),
+    "open_ports": (None, (c_void_p,)),
     "pass_time": (None, (c_void_p, c_int64)),
+    "plug": (None, (c_void_p, c_int32)),
+    "port_receive": (c_int32, (c_void_p, c_int32, c_void_p, c_int32)),
+    "port_send": (c_int32, (c_void_p, c_int32, c_char_p, c_int32)),
+    "port_wait": (c_int32, (c_void_p, c_int64, c_void_p)),
     "read": (c_int32, (c_int32, c_char_p, c_int32, c_void_p)),
+    "read_chunk": (c_int32, (c_void_p,)),
     "receive": (None, (c_void_p, c_char_p, c_int64, c_int64)),
     "receiver": (c_void_p, (c_int32,)),
+    "resume": (c_int64, (c_void_p, c_int64)),
     "send": (None, (c_void_p, c_char_p, c_int64, c_int64, c_char_p)),
     "send_copy": (None, (c_void_p, c_char_p, c_int64, c_int64, c_int32, c_int32)),
     "send_reply": (None, (c_void_p, c_int32, c_char_p, c_int64, c_int64, c_int64)),
     "set_timer": (None, (c_void_p, c_int64)),
+    "serve": (c_int32, (c_void_p,)),
+    "sleep_ns": (c_int64, (c_void_p, c_int64, c_int64, c_int64)),
     "start": (None, (c_void_p,)),
     "status": (c_int64, (c_int32, c_int32, c_int32, c_char_p, c_int64, c_void_p)),
     "take": (c_int64, (c_void_p, c_void_p, c_int64)),
+    "watch": (None, (c_void_p, c_int32)),
     "withdraw": (None, (c_void_p,)),
+    "woke": (None, (c_void_p, c_int64)),
 }
 """Functions of the library without their prefix, with the types of result and arguments."""
 
@@ -98,8 +122,16 @@ def line_library() -> LineLibrary:
     """
     found = load_compiled(SOURCE, LineLibrary)
     for name, (result, arguments) in _FUNCTIONS.items():
-        function = getattr(found, f"line_{name}")
-        function.argtypes, function.restype = arguments, result
+        function = getattr(found, f"line_{name}", None)  # Only Linux has those of pseudo-terminals
+        if function is not None:
+            function.argtypes, function.restype = arguments, result
+    return found
+
+
+def waiting_function() -> Callable[[int], None]:
+    """Return the function that waits for a server's next event, without the interpreter lock."""
+    found = load_compiled(SOURCE, ctypes.CDLL).line_wait
+    found.argtypes, found.restype = (c_void_p,), None
     return found
 
 

@@ -7,12 +7,23 @@
  *
  * The caller provides the time of each event, ns; the time of a line never goes back. */
 
+#define _GNU_SOURCE
+#include <errno.h>
 #include <math.h>
 #include <stdarg.h>
+#include <stdatomic.h>
 #include <stdint.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <time.h>
+#include <unistd.h>
+#ifdef __linux__
+#include <asm/termbits.h>
+#include <poll.h>
+#include <sys/epoll.h>
+#include <sys/ioctl.h>
+#endif
 
 #ifndef SOURCE_CRC
 #define SOURCE_CRC 0 /* CRC-32 of this file: compiled_line.py rejects an object of another version */
@@ -36,7 +47,7 @@ enum { PING = 0x01, READ = 0x02, SYNC_READ = 0x82, FAST_SYNC_READ = 0x8a, BULK_R
 enum { INTO, OUT }; /* directions in the ledger, as seen from the servos */
 /* Tasks of Python, in the order of compiled_line.py */
 enum { STEP, RECEIVES, PRESENT, EXECUTE, EXECUTE_ALL, REFUSED, STAYS_OUT, CHAIN, OVERHEAR, NOTE, ACT, ACT_AFTER,
-       DISTURB, ALTER, PIECE, LEDGER };
+       DISTURB, ALTER, PIECE, LEDGER, RATE };
 
 typedef struct { /* bytes that grow */
     uint8_t *data;
@@ -130,12 +141,13 @@ typedef struct {
     int64_t step_ns;      /* time from which the mechanics have a step to do */
     int64_t timer_ns, delivered;
     int32_t node_count, protocol, baud_rate, bus;
-    int32_t plugged, wedged, echo, slots, recorded, altered, waits;
+    int32_t plugged, unplugged; /* `unplugged`: number of times */
+    int32_t wedged, echo, slots, recorded, altered, waits;
     int32_t split; /* adapter: 0: whole replies, 1: single bytes, 2: random pieces */
     uint8_t disturbed[256];
     uint8_t answer[16]; /* data of a reply of Python */
     int32_t answer_size, entry_count;
-    int32_t raised, unused; /* 1: a task raised an exception, which Python raises when the line has returned */
+    int32_t raised; /* 1: a task raised an exception, which Python raises when the line has returned */
     Entry *entries;     /* of the group read that is being executed */
     Asked *asked;
     Packet packet;
@@ -1398,6 +1410,425 @@ void line_free(Bus *b)
     free(b->sending.data);
     free(b);
 }
+
+/* Virtual time: ports of lines that a host in this process opens. `functions` has the layout that dxlwire documents in
+ * ports.py; each of them gets the ports as its context. */
+
+typedef struct { /* host's end of one line */
+    Bus *bus;
+    int32_t opened; /* how often the adapter had been unplugged when the port was opened */
+    int32_t lost;   /* 1: the host has requested the line again */
+} Port;
+
+typedef struct {
+    void *context;
+    int64_t (*now)(void *context);
+    int32_t (*send)(void *context, int32_t line, const uint8_t *data, int32_t size);
+    int32_t (*receive)(void *context, int32_t line, uint8_t *data, int32_t room);
+    int32_t (*wait)(void *context, int64_t deadline_ns, uint8_t *ready);
+    void (*sleep)(void *context, int64_t until_ns);
+    Port *ports;
+    int64_t *clock;                      /* dxlwire's VirtualClock: the time, and the time of the next scheduled call */
+    int64_t (*advance)(int64_t until_ns); /* lets the clock make the calls that are due */
+    int32_t count, raised;               /* `raised`: `advance` raised an exception */
+} Ports;
+
+static int32_t is_gone(const Port *p) { return p->bus->line.unplugged != p->opened; }
+
+static int64_t ports_now(void *context) { return ((Ports *)context)->clock[0]; }
+
+static void ports_sleep(void *context, int64_t until_ns)
+{
+    Ports *p = context;
+    if (p->clock[1] <= until_ns)
+        p->advance(until_ns);
+    else if (until_ns > p->clock[0])
+        p->clock[0] = until_ns;
+}
+
+static int32_t ports_send(void *context, int32_t line, const uint8_t *data, int32_t size)
+{
+    Ports *p = context;
+    Bus *b = p->ports[line].bus;
+    if (p->raised || b->line.raised || is_gone(&p->ports[line]))
+        return -1;
+    line_receive(b, data, size, p->clock[0]);
+    return b->line.raised ? -1 : size;
+}
+
+static int32_t ports_receive(void *context, int32_t line, uint8_t *data, int32_t room)
+{
+    Ports *p = context;
+    Bus *b = p->ports[line].bus;
+    if (p->raised || b->line.raised || is_gone(&p->ports[line]))
+        return -1;
+    line_drain(b, p->clock[0], -1);
+    return b->line.raised ? -1 : (int32_t)line_take(b, data, room);
+}
+
+/* Advance the time until bytes arrive or `deadline_ns`. `ready` has one flag per line. Return the number of readable
+ * lines; a line that has failed is readable. */
+static int32_t ports_wait(void *context, int64_t deadline_ns, uint8_t *ready)
+{
+    Ports *p = context;
+    memset(ready, 0, (size_t)p->count);
+    for (;;) {
+        int64_t now_ns = p->clock[0], until_ns = deadline_ns;
+        int32_t found = 0;
+        for (int32_t i = 0; i < p->count; i++) { /* time passes for the servos of a lost line, too */
+            const Port *port = &p->ports[i];
+            int64_t waiting = line_drain(port->bus, now_ns, -1);
+            int32_t failed = p->raised || port->bus->line.raised;
+            ready[i] = failed || (!port->lost && (waiting || is_gone(port)));
+            found += ready[i];
+        }
+        if (found || now_ns >= deadline_ns)
+            return found;
+        for (int32_t i = 0; i < p->count; i++) {
+            int64_t due_ns = line_next_due(p->ports[i].bus);
+            until_ns = due_ns < until_ns ? due_ns : until_ns;
+        }
+        ports_sleep(p, until_ns);
+    }
+}
+
+/* Set the functions of ports; the caller owns their memory. */
+void line_open_ports(Ports *p)
+{
+    p->context = p;
+    p->now = ports_now;
+    p->send = ports_send;
+    p->receive = ports_receive;
+    p->wait = ports_wait;
+    p->sleep = ports_sleep;
+}
+
+/* Open the port of a line: bytes that were delivered to another one are lost. */
+void line_open_port(Ports *p, int32_t line)
+{
+    Port *port = &p->ports[line];
+    port->opened = port->bus->line.unplugged;
+    port->lost = 0;
+    port->bus->out.size = 0;
+}
+
+/* The functions for hosts in Python */
+
+int32_t line_port_send(Ports *p, int32_t line, const uint8_t *data, int32_t size) { return ports_send(p, line, data, size); }
+
+int32_t line_port_receive(Ports *p, int32_t line, uint8_t *data, int32_t room) { return ports_receive(p, line, data, room); }
+
+int32_t line_port_wait(Ports *p, int64_t deadline_ns, uint8_t *ready) { return ports_wait(p, deadline_ns, ready); }
+
+/* Real time: pseudo-terminals of lines that hosts open, served together */
+
+#ifdef __linux__
+
+#define CHUNK 4096                   /* bytes of one read; a shorter result means that no more bytes are waiting */
+#define MOST_BACKLOG_NS 20000000     /* host's bytes that wait for the wire, as wire time; then the host is not read */
+#define GATHER_NS 250000             /* replies that end within this time are delivered together, as by USB */
+#define LONGEST_SLEEP_NS 10000000    /* while a host watches the progress, so that a longer pause shows as a stall */
+#define STALL_NS 20000000            /* pause between two readings of the clock from which it counts as a stall */
+#define LONGEST_POLL_NS 50000        /* before a reply is due: a sleep wakes some 30 us late on a stock kernel */
+#define POLL_SHARE 6                 /* polling is limited to one part in this many of the time of waiting */
+#define BUDGET_NS 20000000
+#define PAUSE_NS 100000              /* shortest sleep while polling is not allowed */
+#define MOST_TERMINALS 256
+#define OTHERS 4                     /* descriptors of Python that wake the server as well */
+
+enum { TAKEN, SERVED, GIVEN, DUE }; /* words of a line's progress, for the host: heartbeat.py */
+enum { ADAPTER = 1, ASKED_FOR = 2 }; /* what Python has to do */
+
+typedef struct { /* decides how long a server sleeps before an event, and when it polls the clock instead */
+    int64_t budget_ns, asked_ns, woken_ns;
+    int32_t polls, unused;
+} PollBudget;
+
+typedef struct { /* simulation's end of a terminal, whose other end hosts open like the port of an adapter */
+    Bus *bus;
+    int64_t *progress; /* words of the line's progress; NULL: nobody watches */
+    int64_t taken_ns, served_ns;
+    int64_t held_ns;   /* time until which the terminal is not read because its host is too fast; 0: it is read */
+    int32_t descriptor, opened; /* `opened`: how often the adapter had been unplugged */
+    int32_t plugged, ready, size, known;
+    uint8_t settings[44]; /* struct termios2 at the host's last write; valid if `known` */
+    uint8_t chunk[4096];
+} Terminal;
+
+typedef struct {
+    Terminal **terminals;
+    void (*stalled)(int64_t begin_ns, int64_t end_ns);
+    int64_t easy_ns; /* time of Python's next work, which need not be punctual; NEVER: none */
+    int64_t soonest_ns, looked_ns;
+    int32_t count, waiting; /* `waiting`: descriptor of epoll */
+    int32_t watched, news;
+    PollBudget polling;
+} Server;
+
+static int64_t clock_ns(void)
+{
+    struct timespec t;
+    clock_gettime(CLOCK_MONOTONIC, &t);
+    return (int64_t)t.tv_sec * 1000000000 + t.tv_nsec;
+}
+
+/* Return the time to sleep before the next event, ns; 0: poll the clock; NEVER: sleep until a host writes. `due_ns`:
+ * next punctual event; `easy_ns`: next event that need not be punctual. Polling is punctual but uses the processor. It
+ * is limited to a sixth of the time by which the process waits longer than it works. */
+int64_t line_sleep_ns(PollBudget *p, int64_t due_ns, int64_t now_ns, int64_t easy_ns)
+{
+    int64_t spent_ns = (now_ns - p->woken_ns) / POLL_SHARE, left_ns = due_ns - now_ns;
+    p->asked_ns = now_ns;
+    p->budget_ns = p->budget_ns - spent_ns > -BUDGET_NS ? p->budget_ns - spent_ns : -BUDGET_NS;
+    p->polls = 0;
+    if (easy_ns != NEVER && (due_ns == NEVER || easy_ns < due_ns - LONGEST_POLL_NS))
+        return easy_ns > now_ns ? easy_ns - now_ns : 0;
+    if (due_ns == NEVER)
+        return NEVER;
+    if (left_ns > LONGEST_POLL_NS)
+        return left_ns - (p->budget_ns > 0 ? LONGEST_POLL_NS : 0);
+    p->polls = p->budget_ns > 0;
+    return p->polls || left_ns <= 0 ? 0 : PAUSE_NS;
+}
+
+/* Charge the time since the last `line_sleep_ns` to the budget; call it after each sleep or polling. */
+void line_woke(PollBudget *p, int64_t now_ns)
+{
+    int64_t waited_ns = now_ns - p->asked_ns, spent_ns = p->polls ? waited_ns : 0;
+    p->woken_ns = now_ns;
+    p->budget_ns += waited_ns / POLL_SHARE - spent_ns;
+    if (p->budget_ns > BUDGET_NS)
+        p->budget_ns = BUDGET_NS;
+}
+
+static void publish(Terminal *t, int32_t word, int64_t value)
+{
+    atomic_store_explicit((_Atomic int64_t *)&t->progress[word], value, memory_order_release);
+}
+
+/* Publish that a line is served up to its next delivery to the host. */
+static int64_t publish_served(Terminal *t)
+{
+    int64_t due_ns = line_next_delivery(t->bus, GATHER_NS);
+    if (t->progress && due_ns != t->served_ns) {
+        publish(t, SERVED, due_ns);
+        t->served_ns = due_ns;
+    }
+    return due_ns;
+}
+
+/* Return the time. If the process was stalled before, let Python publish the stall. */
+static int64_t look_at_clock(Server *s)
+{
+    int64_t now_ns = clock_ns(), since_ns = s->looked_ns;
+    s->looked_ns = now_ns;
+    if (s->watched && now_ns - since_ns > STALL_NS)
+        s->stalled(since_ns, now_ns);
+    return now_ns;
+}
+
+/* Return the time of the next delivery to any host, NEVER without one; publish it for each line. */
+int64_t line_find_delivery(Server *s)
+{
+    look_at_clock(s);
+    s->soonest_ns = NEVER;
+    for (int32_t i = 0; i < s->count; i++) {
+        int64_t due_ns = publish_served(s->terminals[i]);
+        s->soonest_ns = due_ns < s->soonest_ns ? due_ns : s->soonest_ns;
+    }
+    return s->soonest_ns;
+}
+
+static int32_t changed(const Terminal *t)
+{
+    return t->opened != t->bus->line.unplugged || t->plugged != t->bus->line.plugged;
+}
+
+/* Read one chunk of bytes that the host has written, and keep it. */
+int32_t line_read_chunk(Terminal *t)
+{
+    ssize_t count = t->size < CHUNK ? read(t->descriptor, t->chunk + t->size, (size_t)(CHUNK - t->size)) : 0;
+    t->size += count > 0 ? (int32_t)count : 0; /* no data, or no host */
+    return t->size == CHUNK;
+}
+
+/* Pass the bytes that were read to the line, as written at `now_ns`, with the host's baud rate. Return their number. */
+int32_t line_accept(Terminal *t, int64_t now_ns)
+{
+    struct termios2 settings;
+    _Static_assert(sizeof settings == sizeof t->settings, "the layout of struct Terminal");
+    int32_t size = t->size;
+    t->size = 0;
+    if (!size)
+        return 0;
+    memset(&settings, 0, sizeof settings);
+    ioctl(t->descriptor, TCGETS2, &settings);
+    if (!t->known || memcmp(&settings, t->settings, sizeof settings)) { /* the rate changes only with the settings */
+        memcpy(t->settings, &settings, sizeof settings);
+        t->known = 1;
+        if (settings.c_ospeed && (int64_t)settings.c_ospeed != t->bus->line.baud_rate)
+            t->bus->line.call(RATE, settings.c_ospeed, 0);
+    }
+    line_receive(t->bus, t->chunk, size, now_ns);
+    return size;
+}
+
+/* Write the bytes of the line that are due to the host; bytes that do not fit into the terminal are lost. */
+void line_deliver(Terminal *t, int64_t now_ns)
+{
+    Bus *b = t->bus;
+    int64_t handed_ns = clock_ns();
+    if (!line_drain(b, now_ns, handed_ns))
+        return;
+    if (t->progress) {
+        t->progress[DUE] = handed_ns - b->line.lateness_ns[(b->line.delivered + LATENESSES - 1) % LATENESSES];
+        publish(t, GIVEN, handed_ns);
+    }
+    ssize_t written = write(t->descriptor, b->out.data, (size_t)b->out.size);
+    int64_t lost = b->out.size - (written > 0 ? written : 0);
+    b->out.size = 0;
+    if (lost)
+        note(b, "%lld bytes to the host are lost: the host does not read", (long long)lost);
+}
+
+static void watch(const Server *s, int32_t index, int operation)
+{
+    /* Edge-triggered, to report each write of a host once: a terminal without a host is at end of file all the time */
+    struct epoll_event event = {.events = EPOLLIN | EPOLLET, .data.u64 = (uint64_t)index};
+    epoll_ctl(s->waiting, operation, s->terminals[index]->descriptor, &event);
+}
+
+static void deliver(Server *s, Terminal *t, int64_t now_ns)
+{
+    line_deliver(t, now_ns);
+    if (changed(t))
+        s->news |= ADAPTER;
+}
+
+static void receive_from(Server *s, int32_t index, int64_t now_ns)
+{
+    Terminal *t = s->terminals[index];
+    if (line_next_due(t->bus) <= now_ns)
+        deliver(s, t, now_ns);
+    if (!t->plugged || changed(t))
+        return;
+    int32_t more = t->size == CHUNK, count = line_accept(t, now_ns);
+    if (count && t->progress) {
+        int64_t start_ns = t->taken_ns > now_ns ? t->taken_ns : now_ns;
+        t->taken_ns = start_ns + duration_ns(t->bus, count);
+        publish_served(t); /* first: a host that sees the bytes as received relies on the due time of the reply */
+        publish(t, TAKEN, t->taken_ns);
+    }
+    if (t->bus->line.host_free_ns - MOST_BACKLOG_NS > now_ns) {
+        t->held_ns = t->bus->line.host_free_ns - MOST_BACKLOG_NS;
+        watch(s, index, EPOLL_CTL_DEL);
+    } else if (more)
+        watch(s, index, EPOLL_CTL_MOD); /* reports the waiting bytes once more */
+}
+
+/* Look which descriptors are ready. Descriptors of Python have numbers from MOST_TERMINALS on. */
+static int32_t look(Server *s)
+{
+    struct epoll_event events[MOST_TERMINALS + OTHERS];
+    int32_t count = epoll_wait(s->waiting, events, MOST_TERMINALS + OTHERS, 0), found = 0;
+    for (int32_t i = 0; i < count; i++, found++)
+        if (events[i].data.u64 < MOST_TERMINALS)
+            s->terminals[events[i].data.u64]->ready = 1;
+        else
+            s->news |= ASKED_FOR;
+    return found;
+}
+
+/* Wait until a host writes, a delivery is due, or Python has work. Runs without Python's lock. */
+void line_wait(Server *s)
+{
+    PollBudget *p = &s->polling;
+    int64_t now_ns = clock_ns(), easy_ns = s->easy_ns, due_ns = s->soonest_ns;
+    if (s->watched && now_ns + LONGEST_SLEEP_NS < easy_ns)
+        easy_ns = now_ns + LONGEST_SLEEP_NS;
+    int64_t sleep_ns = line_sleep_ns(p, due_ns, now_ns, easy_ns);
+    if (sleep_ns) {
+        struct pollfd one = {s->waiting, POLLIN, 0};
+        struct timespec timeout = {sleep_ns / 1000000000, sleep_ns % 1000000000};
+        ppoll(&one, 1, sleep_ns == NEVER ? NULL : &timeout, NULL); /* in ns: epoll alone has only milliseconds */
+        if (look(s) || due_ns == NEVER)
+            return;
+        now_ns = clock_ns();
+        line_woke(p, now_ns);
+        if (line_sleep_ns(p, due_ns, now_ns, NEVER))
+            return;
+    }
+    while (!look(s) && due_ns != NEVER && clock_ns() < due_ns)
+        ;
+}
+
+/* Deliver what is due, and receive what hosts have written. Return what Python has to do. */
+int32_t line_serve(Server *s)
+{
+    int64_t now_ns = look_at_clock(s);
+    line_woke(&s->polling, now_ns);
+    /* Replies that were due before the host wrote go out first, because the host could have read them. */
+    for (int32_t i = 0; s->soonest_ns <= now_ns && i < s->count; i++)
+        if (line_next_delivery(s->terminals[i]->bus, GATHER_NS) <= now_ns)
+            deliver(s, s->terminals[i], now_ns);
+    for (int32_t rounds = s->count, any = 1; any;) { /* a host that drives all buses writes to them in one go */
+        any = 0;
+        for (int32_t i = 0; i < s->count; i++)
+            if (s->terminals[i]->ready) {
+                line_read_chunk(s->terminals[i]);
+                any = 1;
+            }
+        /* Read after the bytes, so that no host gets a reply before it wrote, even if other lines take long */
+        now_ns = look_at_clock(s);
+        for (int32_t i = 0; i < s->count; i++)
+            if (s->terminals[i]->ready) {
+                s->terminals[i]->ready = 0;
+                receive_from(s, i, now_ns);
+            }
+        any = any && --rounds > 0 && look(s);
+    }
+    int32_t news = s->news;
+    s->news = 0;
+    return news;
+}
+
+/* Resume reading slowed hosts. Return the time at which the next one is read; NEVER without one. */
+int64_t line_resume(Server *s, int64_t now_ns)
+{
+    int64_t next_ns = NEVER;
+    for (int32_t i = 0; i < s->count; i++) {
+        Terminal *t = s->terminals[i];
+        if (!t->held_ns)
+            continue;
+        if (t->held_ns <= now_ns) {
+            t->held_ns = 0;
+            watch(s, i, EPOLL_CTL_ADD);
+        } else if (t->held_ns < next_ns)
+            next_ns = t->held_ns;
+    }
+    return next_ns;
+}
+
+/* Begin to serve the device that a terminal has now. */
+void line_plug(Server *s, int32_t index)
+{
+    Terminal *t = s->terminals[index];
+    t->opened = t->bus->line.unplugged;
+    t->plugged = t->bus->line.plugged;
+    t->held_ns = t->ready = t->size = t->known = 0;
+    watch(s, index, EPOLL_CTL_DEL); /* fails for a new device */
+    if (t->plugged)
+        watch(s, index, EPOLL_CTL_ADD);
+}
+
+/* Wake also when a descriptor of Python is readable. */
+void line_watch(Server *s, int32_t descriptor)
+{
+    struct epoll_event event = {.events = EPOLLIN, .data.u64 = MOST_TERMINALS};
+    epoll_ctl(s->waiting, EPOLL_CTL_ADD, descriptor, &event);
+}
+
+#endif
 
 /* Return a status packet in `data`, which has room for one of any size, and its size. */
 int64_t line_status(int32_t protocol, int32_t id, int32_t error, const uint8_t *parameters, int64_t size, uint8_t *data)

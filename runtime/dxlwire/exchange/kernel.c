@@ -36,6 +36,7 @@ typedef unsigned nfds_t;
 #define RECORD_HEADER 24 /* bus, kind, ID, pad, length, two times: packets.py */
 #define REPEATED 50      /* cycles after which an unchanged goal is sent again: a sync write has no acknowledgement */
 #define NEVER ((int64_t)1 << 62)
+#define LOST_LINE_STEP_NS 200000  /* same value as in bus_engine.py */
 #define WRITE_TIMEOUT_NS 20000000 /* same value as _WRITE_TIMEOUT_NS in ports.py */
 #define LEAST_NAP_NS 15000        /* a shorter sleep is not worth its wake-up; the time is polled instead */
 
@@ -137,6 +138,15 @@ typedef struct { /* polling for replies shortly before they are due: ReplyPollin
     int32_t enabled, slept;
 } Polling;
 
+typedef struct { /* functions of ports without file descriptors, as on virtual time: ports.py */
+    void *context; /* first argument of each function */
+    int64_t (*now)(void *context);
+    int32_t (*send)(void *context, int32_t line, const uint8_t *data, int32_t size);    /* -1: the line is gone */
+    int32_t (*receive)(void *context, int32_t line, uint8_t *data, int32_t room);       /* bytes; -1: it is gone */
+    int32_t (*wait)(void *context, int64_t deadline_ns, uint8_t *ready); /* number of readable lines */
+    void (*sleep)(void *context, int64_t until_ns);
+} PortFunctions;
+
 typedef struct Kernel {
     Line *lines;
     const Servo *servos;
@@ -160,10 +170,7 @@ typedef struct Kernel {
     uint8_t *desk; /* log batch that is not committed yet; NULL: no log */
     uint64_t *used;
     int64_t desk_room, reserved, beat_ns;
-    int64_t (*now)(void);
-    int32_t (*send)(int32_t line, const uint8_t *data, int32_t size);
-    int32_t (*receive)(int32_t line, uint8_t *data, int32_t room);
-    int32_t (*wait)(int64_t deadline_ns, uint8_t *ready);
+    const PortFunctions *ports; /* NULL: the lines have file descriptors */
     int32_t line_count, servo_count, write_line, write_number, device_count;
     int32_t raised; /* 1 after one of these functions raised an exception: every call then fails */
     Polling polling;
@@ -178,9 +185,25 @@ static int64_t clock_ns(void)
     return (int64_t)t.tv_sec * 1000000000 + t.tv_nsec;
 }
 
-static int64_t now_ns(const Kernel *k) { return k->now ? k->now() : clock_ns(); }
+static int64_t now_ns(const Kernel *k) { return k->ports ? k->ports->now(k->ports->context) : clock_ns(); }
 
 static int is_read(const Line *l) { return l->planned && !l->words[LOST]; }
+
+/* Wait for bytes on any line of ports without file descriptors. */
+static int32_t wait_for_ports(Kernel *k, int64_t deadline_ns, uint8_t *ready)
+{
+    const PortFunctions *ports = k->ports;
+    int32_t heard = ports->wait(ports->context, deadline_ns, ready), found = 0;
+    for (int32_t i = 0; i < k->line_count; i++) {
+        ready[i] = ready[i] && is_read(&k->lines[i]);
+        found += ready[i];
+    }
+    if (heard && !found) { /* a lost line is always readable: let time pass */
+        int64_t step = ports->now(ports->context) + LOST_LINE_STEP_NS;
+        ports->sleep(ports->context, step < deadline_ns ? step : deadline_ns);
+    }
+    return found;
+}
 
 /* Wait for bytes on any line. `ready` has one flag per line. Return the number of readable lines. */
 static int32_t wait_for(Kernel *k, int64_t deadline_ns, uint8_t *ready)
@@ -188,8 +211,8 @@ static int32_t wait_for(Kernel *k, int64_t deadline_ns, uint8_t *ready)
     struct pollfd set[MOST_LINES];
     int32_t line[MOST_LINES], count = 0, found = 0;
     memset(ready, 0, (size_t)k->line_count);
-    if (k->wait)
-        return k->wait(deadline_ns, ready);
+    if (k->ports)
+        return wait_for_ports(k, deadline_ns, ready);
     for (int32_t i = 0; i < k->line_count; i++)
         if (is_read(&k->lines[i])) {
             set[count] = (struct pollfd){k->lines[i].descriptor, POLLIN, 0};
@@ -212,8 +235,8 @@ static int32_t wait_for(Kernel *k, int64_t deadline_ns, uint8_t *ready)
 /* Write one whole packet to a line. Return false when the line is gone or accepts no more bytes. */
 static int send_all(Kernel *k, Line *l, const uint8_t *data, int32_t size)
 {
-    if (k->send) {
-        l->gone = k->send((int32_t)(l - k->lines), data, size) < 0 ? -1 : 0;
+    if (k->ports) {
+        l->gone = k->ports->send(k->ports->context, (int32_t)(l - k->lines), data, size) < 0 ? -1 : 0;
         return !l->gone;
     }
     int64_t deadline = 0;
@@ -248,8 +271,8 @@ static int32_t receive(Kernel *k, Line *l)
 {
     uint8_t *place = l->buffer + l->have;
     int32_t room = l->room - l->have;
-    if (k->receive)
-        return k->receive((int32_t)(l - k->lines), place, room);
+    if (k->ports)
+        return k->ports->receive(k->ports->context, (int32_t)(l - k->lines), place, room);
     ssize_t count = read(l->descriptor, place, (uint32_t)room);
     if (count > 0)
         return (int32_t)count;
@@ -746,7 +769,7 @@ static int32_t read_all(Kernel *k)
         if (now >= stop)
             return WAITING;
         int64_t end = deadline < stop ? deadline : stop;
-        int32_t found = k->polling.enabled && !k->wait ? poll_for_replies(k, end, ready) : 0;
+        int32_t found = k->polling.enabled && !k->ports ? poll_for_replies(k, end, ready) : 0;
         if (!found)
             found = wait_for(k, end, ready);
         now = now_ns(k);

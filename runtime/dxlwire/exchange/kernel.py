@@ -22,7 +22,7 @@ from dxlwire.bus_plan import BusPlan, Field
 from dxlwire.compiled import array_of, load_compiled, parse_structs
 from dxlwire.exceptions import PortError
 from dxlwire.exchange.arrays import Floats
-from dxlwire.exchange.bus_engine import BEAT_NS, LOST_LINE_STEP_NS, NEVER, Lines
+from dxlwire.exchange.bus_engine import BEAT_NS, NEVER, Lines
 from dxlwire.exchange.device_samples import DeviceSamples
 from dxlwire.exchange.goal_writes import SyncWrite
 from dxlwire.exchange.samples import Samples
@@ -51,9 +51,10 @@ class Answer(IntEnum):
 
 
 AWAITING = 1  # State of a line whose read was sent; 0: no read was sent in this cycle
-_NOW = ctypes.CFUNCTYPE(c_int64)
-_TRANSFER = ctypes.CFUNCTYPE(c_int32, c_int32, POINTER(c_uint8), c_int32)
-_WAIT = ctypes.CFUNCTYPE(c_int32, c_int64, POINTER(c_uint8))
+_NOW = ctypes.CFUNCTYPE(c_int64, c_void_p)
+_TRANSFER = ctypes.CFUNCTYPE(c_int32, c_void_p, c_int32, POINTER(c_uint8), c_int32)
+_WAIT = ctypes.CFUNCTYPE(c_int32, c_void_p, c_int64, POINTER(c_uint8))
+_SLEEP = ctypes.CFUNCTYPE(None, c_void_p, c_int64)
 
 SOURCE = Path(__file__).with_name("kernel.c")
 LIBRARY = SOURCE.with_name("libkernel.so")  # Output of the build
@@ -336,35 +337,40 @@ class Kernel:
         return ctypes.addressof(array)
 
     def _lay_ports(self) -> None:
-        """Pass the kernel file descriptors of the ports, or callbacks to ports and clock if there are
-        none, as in a simulation."""
+        """Pass the kernel file descriptors of the ports, or their functions if there are none, as in a
+        simulation."""
         if (descriptors := self._ports.descriptors) is not None:
             for line, descriptor in zip(self._lines, descriptors, strict=False):
                 line.descriptor = descriptor
             return
         self._kernel.beat_ns = NEVER
+        self._kernel.ports = self._ports.functions or self._functions_in_python()
+
+    def _functions_in_python(self) -> int:
+        """Return the address of functions that call the methods of the ports."""
         calls = {
             "now": _NOW(self._now),
             "send": _TRANSFER(self._send),
             "receive": _TRANSFER(self._receive),
             "wait": _WAIT(self._wait),
+            "sleep": _SLEEP(self._sleep),
         }
-        self._kept.append(calls)
-        for name, call in calls.items():
-            setattr(self._kernel, name, ctypes.cast(call, c_void_p))
+        made = STRUCTS["PortFunctions"](**{name: ctypes.cast(call, c_void_p) for name, call in calls.items()})
+        self._kept += [calls, made]
+        return ctypes.addressof(made)
 
-    # Callbacks of the kernel on virtual time. C cannot propagate an exception, such as a KeyboardInterrupt.
-    # The exception is stored, every later callback fails, and `_raise` raises it when the kernel has
-    # returned.
+    # Functions of ports that have no compiled ones. C cannot propagate an exception, such as a
+    # KeyboardInterrupt. The exception is stored, every later callback fails, and `_raise` raises it when the
+    # kernel has returned.
 
-    def _now(self) -> int:
+    def _now(self, _: int | None) -> int:
         try:
             return self._now_ns()
         except BaseException as error:
             self._keep_raised(error)
             return NEVER
 
-    def _send(self, line: int, data: ctypes._Pointer[c_uint8], size: int) -> int:
+    def _send(self, _: int | None, line: int, data: ctypes._Pointer[c_uint8], size: int) -> int:
         try:
             self._ports.ports[line].write_packet(bytes(data[:size]))
         except PortError:
@@ -374,7 +380,7 @@ class Kernel:
             return -1
         return -1 if self._raised else size
 
-    def _receive(self, line: int, data: ctypes._Pointer[c_uint8], room: int) -> int:
+    def _receive(self, _: int | None, line: int, data: ctypes._Pointer[c_uint8], room: int) -> int:
         array = ctypes.cast(data, POINTER(c_uint8 * room)).contents
         try:
             count = self._ports.ports[line].read_into(memoryview(array).cast("B"))
@@ -385,23 +391,23 @@ class Kernel:
             return -1
         return -1 if self._raised else count
 
-    def _wait(self, deadline_ns: int, ready: ctypes._Pointer[c_uint8]) -> int:
+    def _sleep(self, _: int | None, until_ns: int) -> None:
+        try:
+            self._clock.wait_until(until_ns)
+        except BaseException as error:
+            self._keep_raised(error)
+
+    def _wait(self, _: int | None, deadline_ns: int, ready: ctypes._Pointer[c_uint8]) -> int:
         # After an exception report all lines as readable, so that their calls fail
         indices: Sequence[int] = range(len(self._buses))
         try:
             if self._raised is None:
-                heard = self._ports.wait_for_bytes(deadline_ns)
-                indices = [index for index in heard if self._is_read(index)]
-                if heard and not indices:  # A lost line is always readable: let time pass
-                    self._clock.wait_until(min(deadline_ns, self._now_ns() + LOST_LINE_STEP_NS))
+                indices = self._ports.wait_for_bytes(deadline_ns)
         except BaseException as error:
             self._keep_raised(error)
         for index in indices:
             ready[index] = 1
         return len(indices)
-
-    def _is_read(self, index: int) -> bool:
-        return bool(self._lines[index].planned) and self._buses[index].failure is None
 
     def _raise(self) -> None:
         """Raise the exception that a callback stored while the kernel ran, if any."""

@@ -117,6 +117,15 @@ class Ports(Protocol):
         ...
 
     @property
+    def functions(self) -> int | None:
+        """Address of the functions of compiled ports, `PortFunctions` of kernel.c; None: they have none.
+
+        The exchange kernel then calls these functions instead of the methods of the ports. They must do the
+        same, and return -1 where a method raises an exception: the method then raises it when it is called.
+        """
+        ...
+
+    @property
     def ports(self) -> Sequence[Port]:
         """The open ports, in the order of the plan's buses."""
         ...
@@ -357,6 +366,8 @@ class SerialPorts:
         polling: ReplyPolling | None = None,
     ) -> None:
         self.polling = polling
+        self.functions = None
+        """None, because the lines have file descriptors."""
         self._poll = select.poll()
         for port in ports:
             self._poll.register(port.descriptor, select.POLLIN)

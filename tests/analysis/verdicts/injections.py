@@ -243,6 +243,7 @@ def hand_over_late(story: Story, since_s: float, ms: float, for_s: float, period
     def late_ns(now_ns: int) -> int:
         return round(ms * MS) if now_ns > since_s * S and (now_ns / S - since_s) % period_s < for_s else 0
 
+    story.ports_in_python = True
     story.prepared.append(lambda: [story.hold_back(bus, late_ns) for bus in story.virtual.buses])
 
 

@@ -20,6 +20,7 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 from tests.kit.awaited import DEADLINE_S
+from tests.kit.bus_ports import BusPorts
 from tests.kit.line_faults import change_replies, watch_instructions
 
 from dxlrun.channels.commands import CommandMessage, QueueInbox
@@ -147,6 +148,8 @@ class Story:
         self.virtual: VirtualRobot
         self.numbers = itertools.count()
         """Numbers what happens, for a case that counts something"""
+        self.ports_in_python = False
+        """Whether buses or clock are changed in ways that compiled ports do not see"""
         self.moments: list[tuple[float, float]] = []
         """Begin and end of what happens at some times only"""
 
@@ -288,6 +291,7 @@ class Story:
                 story.evidence[kind] += late_s > 0
                 return super().wait_until(deadline_ns + round(late_s * S))
 
+        self.ports_in_python = True
         self.prepared.append(lambda: setattr(self.virtual.clock, "__class__", Stalling))
 
     def stand_still(self, kind: str, since_s: float, for_ns: int, every_ns: int) -> None:
@@ -304,6 +308,7 @@ class Story:
                     super().wait_until(super().now_ns() + for_ns)
                 return super().now_ns()
 
+        self.ports_in_python = True
         self.prepared.append(lambda: setattr(self.virtual.clock, "__class__", Starved))
 
     # The run
@@ -327,6 +332,8 @@ class Story:
 
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(virtual_run, "log_header", as_of_a_robot)
+            if self.ports_in_python:
+                patch.setattr(virtual_run, "VirtualPorts", BusPorts)
             self.virtual = simulated_robot(
                 file, play=played, duration_s=self.duration_s, log=log, arguments={"port": "sim"}
             )
