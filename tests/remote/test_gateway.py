@@ -263,6 +263,22 @@ def test_what_was_answered_leaves_its_room_to_the_next_ones(desk):
         assert desk.ask("POST", "/controllers/left/commands/many", {"count": 30_000})[0] == 200, number
 
 
+def test_a_command_ends_the_idle_interval_of_the_collector(desk, monkeypatch):
+    monkeypatch.setattr(link, "_IDLE_LOOK_S", 3600.0)
+
+    async def story():
+        collecting = asyncio.create_task(desk.link.collect_until_cancelled())
+        await asyncio.sleep(0)  # it is idle now
+        asked = asyncio.create_task(desk.request("POST", GO, {"positions": [0]}))
+        while not asked.done():
+            desk.take()
+            await asyncio.sleep(0.001)
+        collecting.cancel()
+        return await asked
+
+    assert asyncio.run(story()) == (200, DONE)
+
+
 def test_one_process_may_ask_for_so_many_operations_a_second_but_stop_is_not_counted(desk):
     told = [desk.ask("POST", "/pause")[0] for _ in range(30)]
     assert told == [200] * int(MOST_OPERATIONS / 10) + [429] * (30 - int(MOST_OPERATIONS / 10))

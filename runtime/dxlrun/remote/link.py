@@ -45,9 +45,9 @@ LONGEST_DATA = LONGEST_COMMAND - 1024
 ENTER_S = 6.0
 """Timeout, s, after the loop replied that servos change their operating mode; the loop's own timeout is 5 s.
 """
-# s; polling interval while a command is pending; ten times as long otherwise. The rings are shared memory
-# without a wake-up.
-_LOOK_S = 0.002
+# s; polling intervals while a command is pending, and otherwise. The rings have no wake-up.
+_LOOK_S = 0.0005
+_IDLE_LOOK_S = 0.02
 _HELD = {
     EventCode.STALE_COMMAND: True,
     EventCode.COMMAND: False,
@@ -112,6 +112,8 @@ class Link:
         self._text = 0
         self._pending: dict[int, _PendingCommand] = {}
         self._pending_bytes = 0
+        self._posted = asyncio.Event()
+        """Set when a command is posted, whose answer must not wait for the end of an idle interval."""
         self.take_servo_limits: Callable[[str, tuple[ServoLimit, ...]], object] = lambda joint, limits: None
         """Called with a joint's name and the registers of its servo that limit it, which the loop reads at
         start-up.
@@ -211,6 +213,7 @@ class Link:
         pending = _PendingCommand(size, asyncio.get_running_loop().create_future(), done)
         self._pending[command.number] = pending
         self._pending_bytes += size
+        self._posted.set()
         answer = await self._await_answer(pending, ANSWER_S + min(2 / self.rate, ANSWER_S))
         while isinstance(answer, Acceptance):
             answer = await self._await_answer(pending, ENTER_S)
@@ -294,7 +297,13 @@ class Link:
             if self._began_ns is None:
                 self.newest()
             self.collect_messages()
-            await asyncio.sleep(_LOOK_S if self._pending else 10 * _LOOK_S)
+            if self._pending:
+                await asyncio.sleep(_LOOK_S)
+                continue
+            self._posted.clear()
+            with suppress(TimeoutError):
+                async with asyncio.timeout(_IDLE_LOOK_S):
+                    await self._posted.wait()
 
     def collect_messages(self) -> None:
         """Read the new answers, events and goal reports; abort goals whose reports were lost."""
