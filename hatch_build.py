@@ -38,6 +38,7 @@ SOURCES = tuple(
         ("dxlwire", "exchange", "kernel.c"),
         ("dxlrun", "control", "gate.c"),
         ("dxlsim", "wire", "line.c"),
+        ("dxlrun", "contract", "polynomial.c"),
         ("dxlrun", "channels", "shared_memory.c"),
         ("dxlsim", "motion", "mechanics.c"),
     )

@@ -37,6 +37,7 @@ OBJECTS = {
         "dxl_read_newest",
         "dxl_source",
     },
+    "dxlrun/contract/libpolynomial.so": {"evaluate_pieces", "dxl_source"},
     "dxlrun/control/libgate.so": {"gate_apply", "dxl_source"},
     "dxlsim/motion/libmechanics.so": {"motion_step_to", "dxl_source"},
     "dxlsim/wire/libline.so": {"line_receive", "line_drain", "dxl_source"},

@@ -22,6 +22,7 @@ from dxlrun.contract.hookspecs import Command as Command
 from dxlrun.contract.hookspecs import hookimpl as hookimpl
 from dxlrun.contract.joint_controller import JointController as JointController
 from dxlrun.contract.joint_controller import reading as reading
+from dxlrun.contract.polynomial import Polynomial as Polynomial
 from dxlrun.contract.serial_line import open_serial as open_serial
 from dxlrun.description.base_form import Mistake as Mistake
 from dxlrun.description.base_form import ParametersModel as ParametersModel

@@ -357,6 +357,7 @@ def test_a_wheel_has_every_object_that_is_compiled(build, tmp_path):
         "dxlwire/exchange/libkernel.so",
         "dxlrun/control/libgate.so",
         "dxlsim/wire/libline.so",
+        "dxlrun/contract/libpolynomial.so",
         "dxlrun/channels/libshared_memory.so",
         "dxlsim/motion/libmechanics.so",
     )

@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlrun import Floats, nearest_turn
+from dxlrun import Floats, Polynomial, nearest_turn
 
 LINEAR, CUBIC, QUINTIC = 2, 4, 6
 """Order of a piece: number of its coefficients."""
@@ -38,7 +38,6 @@ A speed has at most three extremes. The end is first, so that a constant speed i
 """
 _APART = 1 / 16
 """Distance between two of the times in `_SHARES`."""
-_MULTIPLY, _ADD = np.multiply, np.add
 _STEPS = 3
 """Iterations of Newton's method for a peak speed. Each doubles the correct digits; a cubic needs only one."""
 
@@ -91,43 +90,6 @@ def solve(
     out[3] = (20 * way - (8 * v1 + 12 * v0) * t - (3 * a0 - a1) * t**2) / (2 * t**3)
     out[4] = (-30 * way + (14 * v1 + 16 * v0) * t + (3 * a0 - 2 * a1) * t**2) / (2 * t**4)
     out[5] = (12 * way - 6 * (v1 + v0) * t + (a1 - a0) * t**2) / (2 * t**5)
-
-
-class Polynomial:
-    """Polynomial piece of each joint, evaluated with its derivatives by Horner's scheme.
-
-    A stage of the scheme is one array: a coefficient, and position, velocity and acceleration of the stages
-    before. Each row is multiplied by the time and gets the row above added: two calls of numpy a stage.
-    """
-
-    def __init__(self, joints: int) -> None:
-        self._stages = np.zeros((QUINTIC, 4, joints))
-        self._product, self._time = np.zeros((3, joints)), np.zeros(())
-        self._scheme = tuple(
-            (self._stages[k, 1:], self._stages[k, :-1], self._stages[k - 1, 1:])
-            for k in range(QUINTIC - 1, 0, -1)
-        )
-        """State of a stage, the rows that are added, and the state of the next stage."""
-        self._last_state, self._last_rows = self._stages[0, 1:], self._stages[0, :-1]
-        self._steps = self._scheme
-
-    def set_piece(self, piece: Floats) -> None:
-        """Copy the coefficients of a piece, shape (order, joints)."""
-        order = len(piece)
-        np.copyto(self._stages[:order, 0], piece)
-        self._stages[order - 1, 1:] = 0.0
-        self._steps = self._scheme[QUINTIC - order :]
-
-    def evaluate(self, t: float, sample: SplineSample) -> None:
-        """Write position, velocity and acceleration, `t` s after the start of the piece, into `sample`."""
-        multiply, add, product, time = _MULTIPLY, _ADD, self._product, self._time
-        time[()] = t  # a number of Python would be converted in each call
-        for state, rows, following in self._steps:
-            multiply(state, time, product)
-            add(product, rows, following)
-        multiply(self._last_state, time, product)
-        add(product, self._last_rows, sample.rows)
-        add(sample.acceleration, sample.acceleration, sample.acceleration)
 
 
 def peak_velocities(piece: Floats, duration: float | Floats) -> tuple[Floats, Floats]:
@@ -284,7 +246,7 @@ class Trajectory:
         self._times = np.zeros(1)
         self._first = self._last = np.zeros((3, joints))
         self._pieces = np.zeros((0, LINEAR, joints))
-        self._on_bridge, self._on_piece = Polynomial(joints), Polynomial(joints)
+        self._on_bridge, self._on_piece = Polynomial(QUINTIC, joints), Polynomial(QUINTIC, joints)
         """The bridge, and the current piece, valid from `_begin_s` to `_end_s` of the points' time."""
         self._begin_s = self._end_s = 0.0
         self._tail = StopTrajectory(joints)
@@ -411,7 +373,7 @@ class Trajectory:
         at rest.
         """
         if t < self.bridge_s:
-            self._on_bridge.evaluate(max(t, 0.0), sample)
+            np.copyto(sample.rows, self._on_bridge.evaluate(max(t, 0.0)))
         elif t < self._tail_s:
             self._sample_points(t, sample)
         elif t < self.duration_s:
@@ -431,7 +393,7 @@ class Trajectory:
             index = max(min(int(self._times.searchsorted(t, side="right")), len(self._pieces)) - 1, 0)
             self._begin_s, self._end_s = float(self._times[index]), float(self._times[index + 1])
             self._on_piece.set_piece(self._pieces[index])
-        self._on_piece.evaluate(t - self._begin_s, sample)
+        np.copyto(sample.rows, self._on_piece.evaluate(t - self._begin_s))
 
 
 class SplineLimits(NamedTuple):

@@ -30,6 +30,7 @@ from dxlrun import (
     Mistake,
     Outcome,
     ParametersModel,
+    Polynomial,
     RegisterChange,
     SpeedPeak,
     Tolerance,
@@ -50,7 +51,6 @@ from dxlrun_controllers.laws.spline import (
     CUBIC,
     DECELERATION,
     LINEAR,
-    Polynomial,
     SplineSample,
     StopTrajectory,
     peak_velocities,
@@ -346,7 +346,7 @@ class KeyframePlayer(Controller[KeyframeParameters]):
         self._wrap = np.array([joint in parameters.wrap for joint in context.joints])
         self._now = SplineSample(count)
         """Present goals, rad, and velocities by the motion's own time, rad/s."""
-        self._piece, self._way = np.zeros((CUBIC, count)), Polynomial(count)
+        self._piece, self._way = np.zeros((CUBIC, count)), Polynomial(CUBIC, count)
         self._ends = np.zeros((2, 2, count))
         """Position and velocity at the start and at the end of the present step."""
         self._stop = StopTrajectory(count)
@@ -499,7 +499,7 @@ class KeyframePlayer(Controller[KeyframeParameters]):
                 self._hand_over()
                 return
         if self._time_s < self._step_s:
-            self._way.evaluate(self._time_s, self._now)
+            np.copyto(self._now.rows, self._way.evaluate(self._time_s))
         else:
             self._reach()
         self._write_commands()

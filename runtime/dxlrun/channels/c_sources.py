@@ -12,6 +12,7 @@ SOURCES = tuple(
     Path(__file__).parents[2] / name
     for name in (
         "dxlrun/channels/shared_memory.c",
+        "dxlrun/contract/polynomial.c",
         "dxlrun/control/gate.c",
         "dxlsim/motion/mechanics.c",
         "dxlsim/wire/line.c",

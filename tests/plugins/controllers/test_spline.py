@@ -5,11 +5,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dxlrun import Polynomial
 from dxlrun_controllers.laws.spline import (
     CUBIC,
     LINEAR,
     QUINTIC,
-    Polynomial,
     SplineSample,
     StopTrajectory,
     Trajectory,
@@ -54,11 +54,10 @@ def test_a_piece_is_scipys(order, start, end, duration, share):
     solve(order, duration, np.array(start)[:, None], np.array(end)[:, None], piece)
     theirs = BPoly.from_derivatives([0, duration], [start[: order // 2], end[: order // 2]])
     scale = max(1.0, *np.abs(start), *np.abs(end)) * max(1.0, duration**2)
-    polynomial = Polynomial(1)
+    polynomial = Polynomial(QUINTIC, 1)
     polynomial.set_piece(np.ones((QUINTIC, 1)))  # an earlier piece leaves nothing
-    polynomial.evaluate(at, found)
     polynomial.set_piece(piece)
-    polynomial.evaluate(at, found)
+    np.copyto(found.rows, polynomial.evaluate(at))
     assert found.position[0] == pytest.approx(float(theirs(at)), abs=1e-12 * scale)
     assert found.velocity[0] == pytest.approx(float(theirs(at, 1)), abs=1e-11 * scale / duration)
     assert found.acceleration[0] == pytest.approx(float(theirs(at, 2)), abs=1e-10 * scale / duration**2)
