@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import copy
+import itertools
 import pickle
 import re
+import sys
 import threading
 from pathlib import Path
 
@@ -166,7 +168,7 @@ def test_reads_are_repeated_and_writes_are_read_back(script):
     assert [one[7] for one in script.sent()] == [READ, READ, READ]
     truncate_next(script.simulated, 2, 0)  # executed, and its acknowledgement lost
     servos.write("goal_position", 3.0)
-    assert [one[7] for one in script.sent()] == [WRITE, READ]
+    assert [one[7] for one in script.sent()] == [WRITE, READ, READ]  # the item, and the Status Return Level
     script.simulated.servos[1].silence()
     with pytest.raises(ServoError) as caught:
         servos.write("goal_position", 3.1)
@@ -572,3 +574,125 @@ def test_examples_of_the_readme_run(capsys):
             exec(example.replace("/dev/ttyUSB0", served.path), {})  # noqa: S102  the README of this repository
         assert [servo.torque for servo in served.snapshot_servos()] == [True, True]
     assert "[3.2" in capsys.readouterr().out
+
+
+def test_alerts_are_shown_with_the_states(script):
+    read = script.bus.scan().reader("present_position")
+    for _ in range(6):
+        assert not read().alert.any()
+    script.simulated.servos[1].trigger_overload()
+    assert read().alert.tolist() == [False, True, False]
+    for _ in range(6):
+        found = read()  # by the kernel again
+    assert found.alert.tolist() == [False, True, False]
+    assert found.valid.all()
+    script.simulated.servos[1].power_cycle()
+    script.let_pass(2)
+    assert not [read() for _ in range(4)][-1].alert.any()
+
+
+def test_alerts_of_protocol_1_are_its_error_bits():
+    script = Script("AX-12A:1-2", protocol=1.0)
+    read = script.bus.scan([1, 2]).reader("present_position", "present_temperature")
+    assert not read().alert.any()
+    script.simulated.servos[0].trigger_overload()
+    assert read().alert.tolist() == [True, False]
+
+
+def test_a_servo_that_acknowledges_no_write_costs_its_timeout_once(script):
+    servos = script.bus.scan([1])
+    servos.write("status_return_level", 1)
+    servos.write("led", 1)
+    began_ns = script.clock.now_ns()
+    script.sent()
+    for value in (0, 1, 0):
+        servos.write("led", value)
+    assert script.clock.now_ns() - began_ns < 10_000_000
+    assert [packet[7] for packet in script.sent()] == [WRITE, READ] * 3
+    assert not script.simulated.servos[0].registers["led"]
+    script.simulated.alter_next_instruction("lost", lambda packet: b"")
+    with pytest.raises(ServoError, match="has not executed the write of LED"):
+        servos.write("led", 1)
+    servos.write("return_delay_time", 9, raw=True)
+    assert script.simulated.servos[0].registers["return_delay_time"] == 9
+    servos.write("status_return_level", 2)
+    script.sent()
+    servos.write("led", 1)
+    assert [packet[7] for packet in script.sent()] == [WRITE]
+
+
+def test_a_lost_line_is_opened_again_with_its_readers_and_writers(script):
+    servos = script.bus.scan()
+    servos.torque = True
+    read, write = servos.reader("present_position"), servos.writer("goal_position")
+    for _ in range(4):
+        start = read().position
+    script.bus.reopen()  # It is not lost
+    script.simulated.unplug()
+    for call in (read, lambda: write(start), lambda: servos.read("led"), script.bus.reopen):
+        with pytest.raises(PortError, match="unplugged"):
+            call()
+    script.simulated.plug_in()
+    with pytest.raises(PortError):
+        read()  # Only `reopen` opens it
+    script.bus.reopen()
+    assert [read() for _ in range(4)][-1].valid.all()
+    write(start + 0.1)
+    script.let_pass(1)
+    assert read().position == pytest.approx(start + 0.1, abs=0.02)
+    script.bus.close()
+    with pytest.raises(PortError, match="is closed"):
+        script.bus.reopen()
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_a_replugged_adapter_is_opened_again(tmp_path, monkeypatch, compiled):
+    monkeypatch.setattr(session, "_is_compiled", lambda: compiled)
+    link = tmp_path / "adapter"
+    with serve_bus("XM430-W350:1-2", link=link) as served:
+        bus = Bus(str(link), served.baud_rate)
+        servos = bus.scan([1, 2])
+        read = servos.reader("present_position")
+        assert read().valid.all()
+    for call in (read, lambda: servos.read("led"), bus.reopen):
+        with pytest.raises(PortError):
+            call()
+    with serve_bus("XM430-W350:1-2", link=link), bus:
+        bus.reopen()
+        assert [read() for _ in range(3)][-1].valid.all()
+        assert servos.read("led").tolist() == [0, 0]
+
+
+@pytest.mark.parametrize(("file", "step"), [("wire/receiver.py", 1), ("exchange/bus_engine.py", 13)])
+def test_ctrl_c_in_any_line_of_the_exchange_leaves_the_next_call_right(file, step):
+    path = str(Path(dxlwire.__file__).parent / file)
+    for number in itertools.count():
+        script = Script(XM)
+        servos = script.bus.scan()
+        read = servos.reader("present_position")
+        position = read().position
+        left = [number * step + 1]
+
+        def trace(frame, event, argument, left=left):
+            if frame.f_code.co_filename != path:
+                return None
+            left[0] -= event == "line"
+            if not left[0]:
+                raise KeyboardInterrupt
+            return trace
+
+        interrupted = False
+        sys.settrace(trace)
+        try:
+            read()
+            servos.read("led")
+        except KeyboardInterrupt:
+            interrupted = True
+        finally:
+            sys.settrace(None)
+        servos[1].write("led", 1)
+        assert servos.read("led").tolist() == [1, 0, 0], number
+        assert [read() for _ in range(2)][-1].position == pytest.approx(position), number
+        if not interrupted:
+            assert number > 20
+            return

@@ -54,9 +54,10 @@ class _InEventLoop(_Waiting):
         async with self.lock:
             session.check_open()
             job = ProgramJob(program)
-            session.engine.load_job(job, waits=True)
-            session.lines.discard_input(session.lines.buses)
-            await self._pump()
+            with session.uninterrupted():
+                session.engine.load_job(job, waits=True)
+                session.lines.discard_input(session.lines.buses)
+                await self._pump()
             return session.finish_program(job.result)
 
     async def read_servos(self, reading: Reading | SdkReading) -> None:
@@ -67,7 +68,8 @@ class _InEventLoop(_Waiting):
             session.check_open()
             reading.begin_cycle(kernel=False)
             try:
-                await self._pump()
+                with session.uninterrupted():
+                    await self._pump()
             finally:
                 reading.end_cycle()  # Also of a cancelled call
             session.log.commit_packets()
@@ -160,6 +162,11 @@ class AsyncBus:
             session.close()
         if failures:
             raise ServoError(session.name, failures)
+
+    async def reopen(self) -> None:
+        """Open the line again after its adapter was unplugged, see `Bus.reopen`."""
+        async with self._waiting.lock:
+            self._waiting.session.reopen_line()
 
     def record(self, path: str | os.PathLike[str]) -> None:
         """Record all packets from now on in a new log, see `Bus.record`."""

@@ -73,6 +73,16 @@ class Bus:
         if failures:
             raise ServoError(self._session.name, failures)
 
+    def reopen(self) -> None:
+        """Open the line again after its adapter was unplugged; servos, readers and writers stay usable.
+
+        The servos may have had no power, so read them before they move. Does nothing if the line is not lost.
+
+        Raises:
+            PortError: The adapter is still missing, or the bus is closed.
+        """
+        self._session.reopen_line()
+
     def record(self, path: str | os.PathLike[str]) -> None:
         """Record all packets from now on in a new log, which `dxlrun analyze` reads.
 

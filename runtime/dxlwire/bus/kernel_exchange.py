@@ -71,6 +71,7 @@ class Reading(ReadRows):
         self.kernel = _kernel(session, plan, self._samples, _Writes())
         self.exchange = CyclicExchange(session.lines, [self.reads], self.kernel)
         self.by_kernel = False
+        self._members = plan.members
         self._read_by = plan.read_by
 
     @property
@@ -84,7 +85,8 @@ class Reading(ReadRows):
         session.check_open()
         if self.begin_cycle():
             try:
-                session.lines.pump()
+                with session.uninterrupted():
+                    session.lines.pump()
             finally:
                 self.end_cycle()  # Also after a KeyboardInterrupt
             session.check_open()
@@ -100,6 +102,7 @@ class Reading(ReadRows):
                 return False
             answer = self.kernel.finish_read(code)
         except BaseException:  # Ctrl-C: replies to the kernel's request are still on the line
+            self.session.is_unfinished = True
             self.exchange.interrupt_kernel()
             self.end_cycle()
             raise
@@ -119,6 +122,10 @@ class Reading(ReadRows):
         for member in range(len(reads.missed)):
             arrived = self._samples.buses[0].arrived(member)
             reads.missed[member] = 0 if arrived else reads.missed[member] + 1
+        # The kernel accepts no other error byte than the one that the parser has read.
+        self._alert.fill(False)
+        for one, error in zip(self._members, reads.errors, strict=True):
+            self._alert[one.device] |= bool(error & self._alert_bits)
         reads.end_cycle()
         reads.given_up.clear()
         self._samples.fill_states(self.session.lines.clock.now_ns())

@@ -16,18 +16,27 @@ from dxlwire.plan.bus_watchdog import MOST_TICKS
 from dxlwire.plan.line import MOST_SPARE, Line, listen_transaction
 from dxlwire.plan.mode_plan import in_mode, mode_plans
 from dxlwire.plan.retry import ATTEMPTS, retry
-from dxlwire.transaction import BROADCAST_ID, Program, Reply, TransactionOutcome
+from dxlwire.transaction import BROADCAST_ID, Program, Reply, Transaction, TransactionOutcome
 
 SHORT_TIMEOUT_NS = 2_000_000
 """Time (ns) that a ping which is probably not answered waits, beyond the latest arrival by the wire."""
 SLOT_NS = 3_000_000
 """Time (ns) for each ID after a broadcast ping, in addition to the bytes of its answer (dynamixel-sdk,
 broadcastPing)."""
+STORED_NS = 50_000_000  # Longest time (ns) of an EEPROM write that no reply ends [i]
 IDENTITY_LENGTH = 3
 """Bytes that identify a node, model number (2) and firmware version (1): the reply to a ping of Protocol 2.0,
 bytes 0..2 of the table in 1.0."""
 USE_TORQUE = "use `servos.torque = True`, which first sets the goal to the present position"
+_ACKNOWLEDGES_NOTHING = 1  # Highest Status Return Level at which writes have no reply
 _LIMITS = ("min_position_limit", "max_position_limit", "cw_angle_limit", "ccw_angle_limit")
+
+
+class ReturnLevel(msgspec.Struct):
+    """Knowledge of a servo's Status Return Level."""
+
+    acknowledges: bool = True
+    """False after the servo was found to answer reads, but no writes: level 1."""
 
 
 class Addressed(msgspec.Struct, frozen=True):
@@ -35,6 +44,7 @@ class Addressed(msgspec.Struct, frozen=True):
 
     servo_id: int
     table: ControlTable
+    level: ReturnLevel = msgspec.field(default_factory=ReturnLevel)
 
 
 class ServoFailed(Exception):
@@ -139,18 +149,11 @@ def _with_level(line: Line, servo_id: int, failure: ServoFailure) -> Program[Ser
 
 def write_item(line: Line, servo: Addressed, item: ControlItem, data: bytes) -> Program[None]:
     """Write one item. An EEPROM item is written only if it differs, and only while torque is off."""
-    if item.area == "EEPROM":
-        try:
-            if (yield from read_item(line, servo.servo_id, item)) == data:
-                return
-            if any((yield from read_item(line, servo.servo_id, servo.table.items["torque_enable"]))):
-                text = f"has torque, so {item.title} in its EEPROM was not written; switch torque off first"
-                raise ServoFailed(ServoFailure("torque_on", text))
-        except ServoFailed as error:
-            # At level 0 the servo answers no read, and this write ends that.
-            if item.name != "status_return_level" or error.failure.kind != "no_reply":
-                raise
-    reply = yield line.write_range(servo.servo_id, item.address, data)
+    if item.area == "EEPROM" and (yield from _is_stored(line, servo, item, data)):
+        return
+    reply = yield _write(line, servo, item, data)
+    if item.name == "status_return_level":
+        servo.level.acknowledges = item.integer(data) > _ACKNOWLEDGES_NOTHING
     if reply.answered:
         return
     failure = failure_of(line, reply, f"the write of {item.title}")
@@ -160,6 +163,8 @@ def write_item(line: Line, servo: Addressed, item: ControlItem, data: bytes) -> 
             text = f"{failure.text}; its Bus Watchdog has stopped it: write 0 to `bus_watchdog`"
             failure = ServoFailure(failure.kind, text)
         raise ServoFailed(failure)
+    if reply.outcome is TransactionOutcome.SENT and item.area == "EEPROM":
+        yield listen_transaction(STORED_NS)
     # Whether the servo has executed the write is unknown.
     present = yield from retry(line.read_range(servo.servo_id, item.address, item.size))
     if not present.answered:
@@ -167,6 +172,41 @@ def write_item(line: Line, servo: Addressed, item: ControlItem, data: bytes) -> 
     if (found := bytes(present.parameters)) != data:
         text = f"has not executed the write of {item.title}: it still contains {item.decode(found)}"
         raise ServoFailed(ServoFailure("not_written", text))
+    yield from _learn_level(line, servo)
+
+
+def _is_stored(line: Line, servo: Addressed, item: ControlItem, data: bytes) -> Program[bool]:
+    """Return True if an EEPROM item has this value; raise ServoFailed if it must not be written."""
+    try:
+        if (yield from read_item(line, servo.servo_id, item)) == data:
+            return True
+        if any((yield from read_item(line, servo.servo_id, servo.table.items["torque_enable"]))):
+            text = f"has torque, so {item.title} in its EEPROM was not written; switch torque off first"
+            raise ServoFailed(ServoFailure("torque_on", text))
+    except ServoFailed as error:
+        # At level 0 the servo answers no read, and this write ends that.
+        if item.name != "status_return_level" or error.failure.kind != "no_reply":
+            raise
+    return False
+
+
+def _write(line: Line, servo: Addressed, item: ControlItem, data: bytes) -> Transaction:
+    """Return the write of an item, without an acknowledgement if the servo sends none."""
+    write = line.write_range(servo.servo_id, item.address, data)
+    if servo.level.acknowledges:
+        return write
+    return replace(line.unanswered(write.packet), servo_id=servo.servo_id)
+
+
+def _learn_level(line: Line, servo: Addressed) -> Program[None]:
+    """Read whether a servo acknowledges writes, after one that it executed without a reply.
+
+    A reply that was lost delays the next write until it can no longer arrive; one that the servo does not
+    send must not."""
+    level = servo.table.items.get("status_return_level")
+    if level is not None and servo.level.acknowledges:
+        found = yield from read_item(line, servo.servo_id, level)
+        servo.level.acknowledges = level.integer(found) > _ACKNOWLEDGES_NOTHING
 
 
 def switch_torque(line: Line, servo: Addressed, on: bool) -> Program[None]:

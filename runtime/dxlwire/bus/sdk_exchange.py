@@ -38,12 +38,13 @@ class SdkReading(ReadRows):
         arrays, now_ns = self._arrays, self._session.clock.now_ns
         for row, (servo_id, blocks) in enumerate(zip(self.ids, self._blocks, strict=True)):
             found: list[tuple[int, float]] = []
-            first_ns = now_ns()
+            first_ns, error = now_ns(), 0
             for block in blocks:
                 start, end = block[0].address, block[-1].address + block[-1].size
                 reply = yield self._session.line.read_range(servo_id, start, end - start)
                 if not reply.answered:
                     break
+                error |= reply.error
                 for item in block:
                     data = reply.parameters[item.address - start :][: item.size]
                     found.append((self._items[item.name], value_in(item, data, raw=self._raw)))
@@ -51,6 +52,7 @@ class SdkReading(ReadRows):
             arrays.valid[row] = whole
             if whole:
                 self._at_ns[row] = first_ns
+                self._alert[row] = bool(error & self._alert_bits)
                 for place, value in found:
                     self._values[place, row] = value
         ended_ns = now_ns()

@@ -24,21 +24,25 @@ class ServoStates:
     An item is an attribute under its name, with or without `present_`: `state.position`,
     `state.goal_position`. A servo that did not answer keeps its last values, NaN before the first."""
 
-    __slots__ = ("_age_ns", "_items", "_values", "ids", "valid")
+    __slots__ = ("_age_ns", "_items", "_values", "alert", "ids", "valid")
 
-    def __init__(
+    def __init__(  # noqa: PLR0917  the arrays of a state
         self,
         items: dict[str, int],
         ids: tuple[int, ...],
         values: Floats,
         valid: NDArray[np.bool_],
         age_ns: NDArray[np.int64],
+        alert: NDArray[np.bool_],
     ) -> None:
         self._items = items
         self._values = values
         self._age_ns = age_ns
         self.ids = ids
         self.valid = valid  # True for each servo that answered
+        self.alert = alert
+        """True for each servo whose last reply reported an error, such as an overload; the item
+        `hardware_error_status` has it."""
 
     @property
     def age(self) -> Floats:
@@ -87,6 +91,9 @@ class ReadRows(ABC):
         self._arrays = ServoRows(
             self._values.reshape(-1), np.zeros(count, np.bool_), np.full(count, -1, np.int64)
         )
+        self._alert = np.zeros(count, np.bool_)
+        # In Protocol 1.0 each bit of the error byte is a state of the servo.
+        self._alert_bits = session.line.dialect.ALERT or 0xFF
 
     @abstractmethod
     def read_servos(self) -> None:
@@ -105,7 +112,12 @@ class ReadRows(ABC):
         """Return the values of the newest cycle."""
         arrays = self._arrays
         return ServoStates(
-            self._items, self.ids, self._values.copy(), arrays.valid.copy(), arrays.age_ns.copy()
+            self._items,
+            self.ids,
+            self._values.copy(),
+            arrays.valid.copy(),
+            arrays.age_ns.copy(),
+            self._alert.copy(),
         )
 
 

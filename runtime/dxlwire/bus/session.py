@@ -8,8 +8,8 @@ from __future__ import annotations
 import sys
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Callable
-from contextlib import AbstractContextManager, ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Protocol
@@ -24,6 +24,7 @@ from dxlwire.packets import Bytes, Desk, PacketKind, PacketLog
 from dxlwire.plan.line import LONGEST_RETURN_DELAY_NS, Line
 from dxlwire.port.latency_timer import is_simulated, latency_timer, shorten
 from dxlwire.port.ports import Ports, SerialPort, SerialPorts
+from dxlwire.port.reopening import lasting_name
 from dxlwire.port.serial_open import open_serial, rate_remark
 from dxlwire.transaction import Program, Result
 from dxlwire.wire.dialect import dialect_of
@@ -89,6 +90,14 @@ class OpenLine(ABC):
             raise PortError(f"{self.name} is closed; use the bus inside its `with` block")
 
     @abstractmethod
+    def reopen_line(self) -> None:
+        """Open the line again after its adapter was unplugged; do nothing if it is not lost.
+
+        Raises:
+            PortError: The adapter is still missing, or the line is closed.
+        """
+
+    @abstractmethod
     def run_program(self, program: Program[Result]) -> Result:
         """Run a program to its end and return its result.
 
@@ -125,6 +134,8 @@ class Session(OpenLine):
         super().__init__(plan, close)
         self.lines = Lines([plan], ports, clock, self.log)
         self.engine: BusEngine = self.lines.buses[0]
+        self.is_unfinished = False
+        """True while the engine works, and after an exception such as Ctrl-C has interrupted it."""
 
     def check_open(self) -> None:
         """Raise PortError if the line is closed or lost."""
@@ -132,11 +143,32 @@ class Session(OpenLine):
         if self.engine.failure is not None:
             raise self.engine.failure
 
+    def reopen_line(self) -> None:
+        """Open the line again after its adapter was unplugged, see `OpenLine.reopen_line`."""
+        with self.lock:
+            super().check_open()
+            if (failure := self.engine.failure) is None:
+                return
+            if not self.lines.ports.reopen(0):
+                raise failure
+            self.engine.receiver.reset()
+            self.engine.replace_port(self.lines.ports.ports[0])
+
+    @contextmanager
+    def uninterrupted(self) -> Iterator[None]:
+        """Repair what Ctrl-C left half done in an earlier block, and note that this one has begun."""
+        if self.is_unfinished:
+            self.engine.receiver.reset()
+        self.is_unfinished = True
+        yield
+        self.is_unfinished = False
+
     def run_program(self, program: Program[Result]) -> Result:
         """Run a program to its end and return its result. Raises PortError if the line is closed or lost."""
         with self.lock:
             self.check_open()
-            (result,) = self.lines.run_programs([program])
+            with self.uninterrupted():
+                (result,) = self.lines.run_programs([program])
             return self.finish_program(result)
 
     def finish_program(self, result: Result | None) -> Result:
@@ -159,11 +191,29 @@ class SdkSession(OpenLine):
         # Imported here because the SDK is not needed where the kernel is compiled.
         from dxlwire.bus.sdk_port import SdkPort
 
-        port = AdjustablePort(path, baud_rate, boot_ns=0)
+        self._port = port = AdjustablePort(path, baud_rate, boot_ns=0)
         latency_ns = STALL_NS if is_simulated(path) else port.most_latency_ns
-        super().__init__(line_plan(path, baud_rate, protocol, latency_ns), port.close)
+        super().__init__(line_plan(path, baud_rate, protocol, latency_ns), self._close_port)
         self.clock = port.clock
         self._exchange = SdkPort(port, protocol, baud_rate, self.log).exchange
+        self._lost = False
+
+    def reopen_line(self) -> None:
+        """Open the line again after its adapter was unplugged, see `OpenLine.reopen_line`."""
+        from dxlwire.bus.sdk_port import SdkPort
+
+        with self.lock:
+            self.check_open()
+            if self._lost:
+                plan = self.plan
+                self._close_port()
+                self._port = AdjustablePort(self.name, plan.baud_rate, boot_ns=0)
+                self._exchange = SdkPort(self._port, plan.protocol, plan.baud_rate, self.log).exchange
+                self._lost = False
+
+    def _close_port(self) -> None:
+        with suppress(OSError):  # of an adapter that is gone
+            self._port.close()
 
     def run_program(self, program: Program[Result]) -> Result:
         """Run a program to its end and return its result. Raises PortError if the line is closed or lost."""
@@ -176,6 +226,9 @@ class SdkSession(OpenLine):
             except StopIteration as end:
                 result: Result = end.value
                 return result
+            except PortError:
+                self._lost = True
+                raise
             finally:
                 self.log.commit_packets()
 
@@ -213,7 +266,14 @@ def open_session(path: str, baud_rate: int, protocol: float) -> Session | SdkSes
         timer = latency_timer(path)
         found_ns = LATENCY_NS if timer is None else max(LATENCY_NS, timer.found_ms * 1_000_000)
         latency_ns = STALL_NS if is_simulated(path) else found_ns
-        ports = SerialPorts([SerialPort(serial.fileno(), path)])
+        lasting = lasting_name(path) or path
+
+        def reopened(_: int) -> int:
+            again = open_serial(lasting, baud_rate)
+            shorten(again.fileno(), lasting, LATENCY_NS)
+            return again.detach()
+
+        ports = SerialPorts([SerialPort(serial.fileno(), path)], reopened)
         plan = line_plan(path, baud_rate, protocol, latency_ns)
         return Session(ports, MonotonicClock(), plan, serial.close)
     except BaseException:

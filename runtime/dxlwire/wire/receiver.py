@@ -66,6 +66,12 @@ class Receiver:
         if self.pending:
             self._forget(self._scan(1))
 
+    def reset(self) -> None:
+        """Drop all pending bytes, after an exception may have interrupted a method."""
+        self.pending = 0
+        self._ends.clear()
+        self._times.clear()
+
     def flush(self) -> None:
         """Stop waiting for the rest of an unfinished packet: deliver all pending bytes, as later packets
         or as noise."""
