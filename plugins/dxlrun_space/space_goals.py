@@ -45,6 +45,14 @@ def _angles(value: object) -> object:
     return tuple(_rad(part.strip() if isinstance(part, str) else part) for part in parts)
 
 
+def _floats(value: object) -> object:
+    """Convert numbers with commas between them."""
+    try:
+        return tuple(map(float, value.split(","))) if isinstance(value, str) else value
+    except ValueError:
+        return value
+
+
 def _rad(value: object) -> object:
     if isinstance(value, str):
         return 0.0 if value in ("0", "0.0") else _angle.validate_python(value)
@@ -53,9 +61,10 @@ def _rad(value: object) -> object:
     return value
 
 
-_Metres = Annotated[float, _number(TypeAdapter(Length))]
-_Speed = Annotated[float, _number(TypeAdapter(LinearVelocity))]
-_Turn = Annotated[float, _number(TypeAdapter(AngularVelocity))]
+_range = Field(ge=-100, le=100)  # beyond, products overflow to infinity and then to NaN
+_Metres = Annotated[float, _number(TypeAdapter(Length)), _range]
+_Speed = Annotated[float, _number(TypeAdapter(LinearVelocity)), _range]
+_Turn = Annotated[float, _number(TypeAdapter(AngularVelocity)), _range]
 _Angles = Annotated[tuple[float, float, float], BeforeValidator(_angles)]
 _Frame = Annotated[str, Field(max_length=_LONGEST_NAME)]
 
@@ -76,7 +85,7 @@ class PoseCommand(CommandModel):
     Without an orientation the tip keeps the present one as far as the arm can"""
     drpy: _Angles | None = None
     """Turn from the orientation at the start about the axes of the frame, rad"""
-    quaternion: tuple[float, float, float, float] | None = None
+    quaternion: Annotated[tuple[float, float, float, float], BeforeValidator(_floats)] | None = None
     """Goal orientation in the frame: x, y, z, w"""
     frame: _Frame = ""
     """Link in whose axes, at the start, all values are; empty: the base of the controller"""

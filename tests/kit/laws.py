@@ -12,6 +12,10 @@ from tests.kit.stages import Stage
 
 from dxlrun import Controller, MotorLoad, MotorModel, Outcome, ServoModel, Stribeck
 from dxlrun_controllers.plugin import dxlrun_controllers
+from dxlrun_space.plugin import dxlrun_controllers as dxlrun_space_controllers
+
+CONTROLLERS = {**dxlrun_controllers(), **dxlrun_space_controllers()}
+"""Import path of each standard controller by its type."""
 
 MOTOR = MotorModel(
     "MX-64", 12.0, 1.6, 3.6, 0.011, 0.1, 0.08, 0.001, Stribeck(0.05, 0.2), 0.158, 32, 1_000_000,
@@ -43,7 +47,7 @@ class Case:
 
     @property
     def controller(self) -> type[Controller[Any]]:
-        found: type[Controller[Any]] = resolve_name(dxlrun_controllers()[self.type])
+        found: type[Controller[Any]] = resolve_name(CONTROLLERS[self.type])
         return found
 
     def stage(self, **options: Any) -> Stage:
@@ -85,6 +89,9 @@ def cases(joints: tuple[str, ...] = ("a", "b", "c")) -> Iterator[Case]:
     yield from ways("position effort pwm", "feed_forward", own | {"most": 0.5}, **scaled)
     yield from ways("position effort pwm", "gravity_compensation", own, **scaled, others=("other",))
     yield from ways("position poseffort effort pwm", "thermal_governor", own | {"warn": 50.0, "limit": 60.0})
+    place = {"x": 0.0, "y": 0.0, "z": -0.1 * len(joints), "rpy": [0.0, 0.9, 0.0], "path": "joints"}
+    poses: list[Ask] = [("twist", {"wy": 0.5}), ("pose", place)]
+    yield Case("cartesian_controller", own | {"tip": f"l{len(joints)}", "orientation": "exact"}, poses)
     yield from _machines(joints)
 
 

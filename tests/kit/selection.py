@@ -44,7 +44,7 @@ TESTED = {
     "log": ("dxlrun.log", "dxlrun.messages"),
     "mechanics": ("dxlrun.features.mechanics",),
     "phidget": ("phidget",),
-    "plugins": ("dxlrun_controllers", "dxlrun.contract", "dxlrun.testing", "example", "docs"),
+    "plugins": ("dxlrun_controllers", "dxlrun_space", "dxlrun.contract", "dxlrun.testing", "example", "docs"),
     "remote": ("dxlrun.remote", "dxlrun.channels"),
     "robots": ("robots", "dxlrun_controllers", "dxlrun.control", "dxlrun.run"),
     "ros2": ("dxlrun_ros2",),

@@ -6,9 +6,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from tests.kit.laws import Case, Story, cases
-
-from dxlrun_controllers.plugin import dxlrun_controllers
+from tests.kit.laws import CONTROLLERS, Case, Story, cases
 
 PHYSICS = pytest.mark.needs("physics")
 EACH = pytest.mark.parametrize(
@@ -21,7 +19,7 @@ EACH = pytest.mark.parametrize(
 
 
 def test_no_type_is_left_out() -> None:
-    assert {case.type for case in cases()} == set(dxlrun_controllers())
+    assert {case.type for case in cases()} == set(CONTROLLERS)
 
 
 @EACH

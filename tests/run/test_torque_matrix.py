@@ -27,7 +27,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from tests.kit.laws import Case, cases, chain_of
+from tests.kit.laws import CONTROLLERS, Case, cases, chain_of
 from tests.kit.line_faults import turn_by_hand
 from tests.kit.stories import replayed
 
@@ -40,7 +40,6 @@ from dxlrun.plan.policy_plan import SLOW_SPEED
 from dxlrun.plan.robot_plan import Plan
 from dxlrun.remote.preparation import Preparation
 from dxlrun.testing import Log, VirtualRobot, plan_of, read_log
-from dxlrun_controllers.plugin import dxlrun_controllers
 from dxlsim.bus.simulated_bus import SimulatedBus
 from dxlsim.faults.fault import parse_fault
 from dxlsim.faults.script import FaultScript
@@ -126,7 +125,7 @@ def _steered(index: int, case: Case, joints: tuple[str, ...]) -> Steered:
 @pytest.mark.needs("physics")
 def test_every_standard_controller_is_in_the_matrix():
     """A new standard type fails here until `tests.kit.laws` has a case for it."""
-    assert {one.case.type for one in steered()} | WITHOUT_JOINTS == set(dxlrun_controllers())
+    assert {one.case.type for one in steered()} | WITHOUT_JOINTS == set(CONTROLLERS)
     assert all(
         not one.controller.interfaces(one.controller.Parameters.model_validate(one.keys), ("x", "y")).command
         for one in cases(("x", "y"))
@@ -141,8 +140,9 @@ def compiled(kind: str, policy: str) -> tuple[Plan, tuple[Steered, ...]]:
     with TemporaryDirectory() as name:
         folder = Path(name)
         (folder / "robot.yaml").write_text(text)
+        moved = [joint for one in ways if one.case.type == "cartesian_controller" for joint in one.joints]
         weights = [one.joints[0] for one in ways if one.case.type == "gravity_compensation"]
-        urdf = chain_of(weights).replace('mass value="0.1"', 'mass value="1e-9"')
+        urdf = chain_of([*moved, *weights]).replace('mass value="0.1"', 'mass value="1e-9"')
         (folder / "matrix.urdf").write_text(urdf)
         for motor in MOTORS.glob("*.motor.yaml"):  # without a load, as the simulated joints
             lines = motor.read_text().splitlines()

@@ -1,12 +1,16 @@
-"""The commands of standard-controllers.md move an arm that runs, on virtual time."""
+"""Commands of a shell to an arm that runs, on virtual time: those of the page, and the refused ones of
+`refusals.txt`, each with the text of the command, of the goal, or of the log.
+"""
 
 from __future__ import annotations
 
+import shlex
 from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.kit.cases import TextCase, case_parameters
 from tests.kit.commands import Dxlrun
 from tests.kit.judged_arms import arms
 from tests.kit.pages import page_commands
@@ -39,6 +43,34 @@ def test_commands_of_the_page(dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch) -
     assert tips[0] == pytest.approx([0.2, 0.0, 0.15], abs=1e-3)  # within the ticks of servos
     assert tips[1] - tips[0] == pytest.approx([0.0, 0.0, 0.05], abs=1e-3)
     assert {state.status for state in robot.goals()} == {"reached"}
+
+
+@pytest.fixture(scope="module")
+def link() -> VirtualLink:
+    found = VirtualLink(plan_of(ROBOTS / "open_manipulator_x_space.yaml"))
+    RemoteRobot("arm", found).send("arm", "pose", {"x": 0.15, "y": 0.0, "z": 0.2, "path": "joints"})
+    for _ in range(300):
+        found.run_cycle()
+    return found
+
+
+@pytest.mark.parametrize("case", case_parameters(Path(__file__).parent / "refusals.txt"))
+def test_bad_input_is_refused_with_the_reason_before_a_joint_moves(
+    case: TextCase, link: VirtualLink, dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot = RemoteRobot("arm", link)
+    monkeypatch.setattr(goals, "connect_robot", lambda *_: nullcontext(robot))
+    before = robot.states().position.copy()
+    newest = robot.goals()[-1].number
+    link.new()
+    said = dxlrun("send", "arm", *shlex.split(case.name))
+    for _ in range(20):
+        link.run_cycle()
+    ended = [f"{state.status} {state.text}" for state in robot.goals() if state.number > newest]
+    found = [said.err, *ended, *(event.text for event in link.new()[1])]
+    assert said.code == 2 or not ended or ended[0].startswith("aborted")
+    assert any(case.lines[0].text in text for text in found), found
+    assert np.array_equal(robot.states().position, before)
 
 
 def test_the_measured_tip_stays_on_a_line_of_20_cm() -> None:
