@@ -133,6 +133,13 @@ class Chain:
         self._tip_at = origin
         return rotation, origin
 
+    def without_turns(self, positions: Sequence[float]) -> tuple[float, ...]:
+        """Return the positions with angles of at most half a turn, which have the same pose."""
+        return tuple(
+            each if slides else math.remainder(each, math.tau)
+            for each, slides in zip(positions, self._slides, strict=True)
+        )
+
     def jacobian(self) -> list[Column]:
         """Return a column per joint, in the order of `joints`, at the positions that `pose` got last."""
         x, y, z = self._tip_at

@@ -28,8 +28,8 @@ STEPS: Final = 20
 """Steps per start of a search."""
 SAMPLES: Final = 1000
 """Positions whose poses are known beforehand. A search begins at those with the nearest poses."""
-STARTS: Final = 128
-"""Most starts for position and orientation; a Koch, the worst arm, needed 79 for one of 4000 poses."""
+STARTS: Final = 64
+"""Most starts for position and orientation; 42 were the most of 2000 poses of four arms."""
 FIRST_PLACES: Final = 4
 PLACES: Final = 8
 """Starts for the position alone. Where the arm is folded, limits keep some of them from a place in reach."""
@@ -118,6 +118,7 @@ class Solver:
         self._posture = tuple(posture) or (None,) * len(chain.joints)
         self._redundant = len(chain.joints) > _POSE and any(each is not None for each in self._posture)
         self._tendency = (_POSTURE * chain.length) ** 2
+        self._unlimited = (-math.inf,) * len(self.lower), (math.inf,) * len(self.upper)
         self._samples = [self._spread(number) for number in range(SAMPLES)]
         poses = [(*place, *rotation) for rotation, place in map(chain.pose, self._samples)]
         self._table = np.array(poses).T.copy()
@@ -173,7 +174,10 @@ class Solver:
 
     def _search_samples(self, target: Pose, best: Solution, exact: bool) -> Search:
         for each in self._nearest(target, EXACT):
-            found = yield from self._descend(target, each, EXACT, is_patient=False)
+            # Limits stop most descents early, so the way may pass them. Whole turns back, its end is a start.
+            free = yield from self._descend(target, each, EXACT, is_patient=False, is_limited=False)
+            back = self.chain.without_turns(free.positions)
+            found = yield from self._descend(target, back, EXACT, is_patient=False)
             best = min(best, found, key=lambda one: _cost(one.residual, exact))
             if best.residual.is_close:
                 return best
@@ -218,11 +222,12 @@ class Solver:
         leash: float = math.inf,
         *,
         is_patient: bool = True,
+        is_limited: bool = True,
     ) -> Search:
-        scale = self.chain.length
+        scale, limits = self.chain.length, (self.lower, self.upper) if is_limited else self._unlimited
         weight = (weight * scale) ** 2
         damping, least, most = (each * scale * scale for each in _DAMPING)
-        now = self._inside(start)
+        now = _inside(start, limits)
         posture = [
             a if b is None else min(max(b, a - leash), a + leash)
             for a, b in zip(now, self._posture, strict=True)
@@ -234,8 +239,8 @@ class Solver:
                 break
             if weight == 0.0 and model.residual.position <= CLOSE_M / 20:
                 break
-            change = self._step(model, now, damping)
-            trial = self._inside([a + b for a, b in zip(now, change, strict=True)])
+            change = self._step(model, now, damping, limits)
+            trial = _inside([a + b for a, b in zip(now, change, strict=True)], limits)
             if max(abs(a - b) for a, b in zip(trial, now, strict=True)) < _STILL:
                 break
             yield
@@ -254,12 +259,6 @@ class Solver:
             before, last = last, model.cost
         return Solution(now, model.residual)
 
-    def _inside(self, positions: Sequence[float]) -> tuple[float, ...]:
-        return tuple(
-            min(max(each, lower), upper)
-            for each, lower, upper in zip(positions, self.lower, self.upper, strict=True)
-        )
-
     def _model(
         self, target: Pose, positions: Sequence[float], posture: Sequence[float], weight: float
     ) -> _Model:
@@ -277,14 +276,14 @@ class Solver:
         cost = far * far + weight * off * off + tendency * sum(pull * pull for pull in pulls)
         return _Model(cost, gradient, columns, weight, Residual(far, off))
 
-    def _step(self, model: _Model, now: Sequence[float], damping: float) -> list[float]:
+    def _step(self, model: _Model, now: Sequence[float], damping: float, limits: _Limits) -> list[float]:
         """Return the change of the joints that minimizes the model; joints at a limit do not move outward."""
-        gradient = model.gradient
+        gradient, (lower, upper) = model.gradient, limits
         free = [
             index
             for index, slope in enumerate(gradient)
-            if not (slope > 0 and now[index] >= self.upper[index])
-            and not (slope < 0 and now[index] <= self.lower[index])
+            if not (slope > 0 and now[index] >= upper[index])
+            and not (slope < 0 and now[index] <= lower[index])
         ]
         change = [0.0] * len(now)
         solved = solve(
@@ -296,6 +295,13 @@ class Solver:
         for index, each in zip(free, solved, strict=True):
             change[index] = each * scale
         return change
+
+
+_Limits = tuple[tuple[float, ...], tuple[float, ...]]
+
+
+def _inside(positions: Sequence[float], limits: _Limits) -> tuple[float, ...]:
+    return tuple(min(max(each, lower), upper) for each, lower, upper in zip(positions, *limits, strict=True))
 
 
 class _Model(msgspec.Struct, frozen=True):

@@ -52,17 +52,19 @@ class TwistMotion:
         self.linear: Vector = (0.0, 0.0, 0.0)
         """Present velocity of the tip, m/s, within its acceleration limit."""
         self.angular: Vector = (0.0, 0.0, 0.0)
+        self._speeds = (0.0,) * len(chain.joints)
         self.held_by = -1
         """Index of the joint that holds the tip at its limit, or -1."""
 
     @property
     def rests(self) -> bool:
-        """True if the tip is not moved."""
-        return not any(self.linear) and not any(self.angular)
+        """True if neither the tip nor a joint is moved."""
+        return not any((*self.linear, *self.angular, *self._speeds))
 
     def drop_twist(self) -> None:
         """Set the velocity to 0 at once."""
         self.linear = self.angular = (0.0, 0.0, 0.0)
+        self._speeds = (0.0,) * len(self._speeds)
 
     def change_twist(self, linear: Vector, angular: Vector, period_s: float) -> None:
         """Bring the present velocity closer to a twist, within the limits of the tip."""
@@ -94,7 +96,12 @@ class TwistMotion:
             if share < scale:
                 scale = share
                 self.held_by = index if share < _STUCK else -1
-        return tuple(now + speed * scale * period_s for now, speed in zip(positions, speeds, strict=True))
+        # Near a singularity the speeds change at once. The tip leaves its direction while the joints follow.
+        self._speeds = tuple(
+            min(max(speed * scale, before - rate * period_s), before + rate * period_s)
+            for speed, before, rate in zip(speeds, self._speeds, self._limits.acceleration, strict=True)
+        )
+        return tuple(now + speed * period_s for now, speed in zip(positions, self._speeds, strict=True))
 
     def _highest(self, index: int, now: float, speed: float, period_s: float) -> float:
         """Return the speed at which a joint still stops at its limit, at most its own limit."""

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from pydantic import ValidationError
+from tests.kit.campaigns import campaign
 from tests.kit.judged_arms import apart, arms
 from tests.kit.stages import Stage
 
@@ -258,9 +259,23 @@ def test_twists_into_singularities_and_limits_are_held(name: str) -> None:
     rows = np.vstack(
         [streamed(stage, 4.0, vx=0.2), streamed(stage, 2.0, vx=-0.2), streamed(stage, 4.0, vz=-0.2)]
     )
-    assert np.abs(np.diff(rows, axis=0)).max() <= SPEED * 0.02 * 1.01
+    assert_smooth(rows)
     assert all(arm.within(row) for row in rows)
     assert np.abs(rows[-1] - rows[-2]).max() < 0.02
+
+
+@pytest.mark.parametrize("name", ["open_manipulator_x", "koch", "six", "op3"])
+@campaign(ci=1, night=20, release=200)
+def test_twists_that_change_at_random_are_smooth(name: str, number: int, chance: random.Random) -> None:
+    arm = all_arms()[name]
+    stage, twist, rows = staged(name, arm.drawn(chance, 0.5)), {}, []
+    for cycle in range(300):
+        if cycle % 50 == 0 or chance.random() < 0.02:
+            names = ("vx", "vy", "vz", "wx", "wy", "wz")
+            twist = {each: chance.uniform(-1, 1) * 10 ** chance.uniform(-2, 1) for each in names}
+        rows += [*streamed(stage, 0.02, **twist)]
+    assert_smooth(np.array(rows))
+    assert all(arm.within(row) for row in rows)
 
 
 def test_a_pose_follows_a_twist_and_a_twist_ends_a_pose() -> None:

@@ -17,7 +17,7 @@ from dxlrun_space.path import MotionLimits, Path, plan_joints
 from dxlrun_space.solver import Solver
 
 NAMES = ("open_manipulator_x", "koch", "op3", "poppy_ergo_jr", "six", "seven")
-MOST_STEPS = 1100  # 550 ms of planning
+MOST_STEPS = 1000  # 500 ms of planning
 SPEED, RATE = 4.0, 20.0  # rad/s, rad/s^2
 all_arms = cache(arms)
 
