@@ -91,7 +91,7 @@ def test_both_protocols_are_found_on_one_line_with_a_warning(
     line: Any = VirtualLine(rate=1_000_000)
     line.bus = MixedBus([ServoConfig(1, "AX-12A", 2.0), ServoConfig(2, "XL430-W250", 2.0)], line.ledger)
     line.ports, line.other_rates = BusPorts(line.clock, [line.bus]), {}
-    line.bus.servo(2).registers.show_live({"present_position": lambda: -16})
+    line.bus.servo(2).show_live({"present_position": lambda: -16})
     monkeypatch.setattr(tool_port, "TunablePort", lambda path: line)
     assert scan("/dev/ttyUSB0", baud=(1_000_000,), ids="1-8", as_json=True) == 0
     said = capsys.readouterr().out

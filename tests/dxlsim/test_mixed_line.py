@@ -20,7 +20,7 @@ def mixed(ledger: Ledger, shown: dict[str, int], *ax_ids: int) -> MixedBus:
     """Return a line of AX-12A and an XL430 whose registers show some values, which may change later."""
     servos = [ServoConfig(servo_id, "AX-12A", 2.0) for servo_id in ax_ids]
     bus = MixedBus([*servos, ServoConfig(X_ID, "XL430-W250", 2.0, 0)], ledger)
-    bus.servo(X_ID).registers.show_live({name: lambda name=name: shown[name] for name in shown})
+    bus.servo(X_ID).show_live({name: lambda name=name: shown[name] for name in shown})
     return bus
 
 

@@ -35,7 +35,8 @@ from typing import Literal, NamedTuple
 from dxlsim.bus.ledger import Ledger
 from dxlsim.device.device_quantities import DeviceQuantities
 from dxlsim.device.simulated_device import SimulatedDevice, make_device
-from dxlsim.motion.mechanics import STEP_NS, Mechanics
+from dxlsim.motion.compiled_mechanics import function_address
+from dxlsim.motion.mechanics import Mechanics
 from dxlsim.servo.making import make_servo
 from dxlsim.servo.node import Node, SimulatedNode
 from dxlsim.servo.simulated_servo import SimulatedServo
@@ -48,7 +49,6 @@ SUPPLY_VOLTS = 12.0  # Supply voltage of a line without servos
 
 _LONGEST_PIECE = 8  # Longest piece with the split `random`, bytes
 _SPLITS = ("whole", "byte", "random")  # In the order of line.c
-_REPLIES_KEPT = 64  # Number of different reads whose servos are cached
 
 Alteration = Callable[[bytes], bytes]  # Changes the bytes of a packet
 
@@ -102,7 +102,6 @@ class SimulatedBus:
         """Actions with the number of instruction packets after which they run, ordered by that number."""
         self._order = itertools.count()
         self._raised: BaseException | None = None
-        self._asked: dict[bytes, tuple[tuple[SimulatedNode, int, int], ...]] = {}
         self._tasks = self._list_tasks()
         self._called = TASK(self._do)
         line = self._line
@@ -111,6 +110,7 @@ class SimulatedBus:
         line.baud_rate = config.baud_rate
         self.absent, line.echo = config.adapter.absent, config.adapter.echo
         line.timer_ns, line.split = config.adapter.latency_timer_ns, _SPLITS.index(config.adapter.split)
+        line.step, line.mechanics = function_address("step_to"), self.mechanics.address
         self._library.line_start(self.address)
         for servo in config.servos:
             self.add_servo(servo)
@@ -244,7 +244,6 @@ class SimulatedBus:
         self._addresses = (ctypes.c_void_p * len(addresses))(*addresses)
         self._line.nodes, self._line.node_count = ctypes.addressof(self._addresses), len(addresses)
         self._line.waits = any(device.waits for device in self.devices)
-        self._asked.clear()
 
     def device(self, servo_id: int) -> SimulatedDevice:
         """Return the first device on the line with this ID. Raises LookupError without one."""
@@ -370,7 +369,7 @@ class SimulatedBus:
 
     def _list_tasks(self) -> list[Callable[[int, int], int | None]]:
         tasks: dict[Task, Callable[[int, int], int | None]] = {
-            Task.STEP: self._step,
+            Task.STEP: lambda now_ns, _: self.mechanics.step_to(now_ns),
             Task.RECEIVES: lambda index, now_ns: self.nodes[index].receives(now_ns),
             Task.PRESENT: self._present,
             Task.EXECUTE: self._execute_for,
@@ -392,21 +391,9 @@ class SimulatedBus:
         }
         return [tasks[task] for task in Task]
 
-    def _step(self, now_ns: int, _: int) -> None:
-        self.mechanics.step_to(now_ns)
-        self._line.step_ns = self.mechanics.grid_ns + STEP_NS
-
     def _present(self, count: int, now_ns: int) -> None:
-        key = ctypes.string_at(self._line.asked, count * ctypes.sizeof(Asked))
-        asked = self._asked.get(key)
-        if asked is None:
-            ranges = (Asked * count).from_buffer_copy(key)
-            asked = tuple((self.nodes[each.node], each.address, each.length) for each in ranges)
-            if len(self._asked) >= _REPLIES_KEPT:
-                self._asked.clear()
-            self._asked[key] = asked
-        for node, address, length in asked:
-            node.present(now_ns, address, length)
+        for each in (Asked * count).from_address(self._line.asked):
+            self.nodes[each.node].present(now_ns, each.address, each.length)
 
     def _execute_for(self, index: int, end_ns: int) -> int:
         """Execute an instruction for a node; the data of its reply go to the line."""

@@ -68,6 +68,7 @@ class SimulatedDevice(SimulatedNode):
         self._place_names = {(item.address, item.size): item.name for item in registers.items.values()}
         memory = Memory(registers, registers.items["firmware_version"].initial or 1)
         super().__init__(memory, device_error, note, now_ns)
+        self.show_live(self._live_items())
         memory["id"] = config.servo_id
         if "return_delay_time" in memory:
             memory["return_delay_time"] = min(254, round(config.return_delay_ns / 2000))

@@ -27,6 +27,38 @@ class StepResult(IntEnum):
     STEP = 3  # Python takes the next step: of another plant, or while shafts are turned by hand
 
 
+@unique
+class ShownQuantity(IntEnum):
+    """Quantities that registers of a servo show."""
+
+    POSITION = 0
+    VELOCITY = 1  # rad/s
+    SETPOINT = 2
+    SETPOINT_VELOCITY = 3  # rad/s
+    DUTY = 4  # Fraction of the supply voltage
+    CURRENT = 5  # A
+    MOVING = 6
+    MOVING_STATUS = 7
+    TEMPERATURE = 8  # degrees C
+    VOLTAGE = 9  # V
+    TIME = 10  # ms since the start
+
+
+@unique
+class Counting(IntEnum):
+    """Ways in which Present Position counts turns of the shaft."""
+
+    ENDLESS = 0
+    JOINT = 1  # One turn; beyond its range the nearest end
+    WHEEL = 2  # One turn, which begins again
+    TURNS = 3  # 16 bits, with Multi Turn Offset and Resolution Divider
+
+
+def function_address(name: str) -> int | None:
+    """Return the address of a compiled function, for other compiled code."""
+    return ctypes.cast(getattr(library(), f"motion_{name}"), c_void_p).value
+
+
 @cache
 def library() -> ctypes.PyDLL:
     """Load the compiled mechanics and declare the types of their functions.
@@ -36,12 +68,16 @@ def library() -> ctypes.PyDLL:
     """
     found = load_compiled(SOURCE, ctypes.PyDLL)
     for name, result, arguments in (
-        ("at_goal", c_int32, (c_void_p,)),
+        ("angle", c_double, (c_void_p,)),
         ("check_rest", None, (c_void_p,)),
         ("drive", None, (c_void_p,)),
         ("end_step", None, (c_void_p,)),
+        ("is_moving", c_int32, (c_void_p,)),
+        ("position_tick", c_double, (c_void_p, c_double)),
+        ("show", None, (c_void_p, c_int64, c_int32, c_int32)),
         ("step_joints", None, (c_void_p, c_void_p, c_void_p, c_void_p, c_void_p, c_int64, c_double)),
         ("step_to", c_int32, (c_void_p, c_int64)),
+        ("whole_turns", c_double, (c_void_p, c_double)),
         ("stribeck", None, (c_void_p, c_void_p, c_void_p, c_int64)),
     ):
         function = getattr(found, f"motion_{name}")

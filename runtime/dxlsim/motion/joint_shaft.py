@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
+from dxlsim.motion.compiled_mechanics import Counting, ShownQuantity
 from dxlsim.motion.control_law import FREE, ServoCommand
 from dxlsim.motion.mechanics import Mechanics
 from dxlsim.motion.motor import Motor
-from dxlsim.motion.shaft import Shaft, Trajectory, in_turn
+from dxlsim.motion.shaft import LiveItem, Shaft, Trajectory
 from dxlsim.registers.access import ACCESS, multi_turn_mode, wheel_mode
 from dxlsim.registers.memory import Memory
 from dxlsim.simulation_plan import Load
@@ -23,6 +24,15 @@ SLOPE_TIMES_P = 1024
 _MID_OF_CURRENT = {"current": 2048, "sensed_current": 512}
 """Value of an item at zero current: MX-64, Current (68), 4.5 mA a tick; EX-106+, Sensed Current (56), 10
 mA a tick."""
+
+_OF_COUNTING = (
+    "cw_angle_limit",
+    "ccw_angle_limit",
+    "control_mode",
+    "multi_turn_offset",
+    "resolution_divider",
+)
+"""Items that decide how Present Position counts."""
 
 _WHEEL_P, _WHEEL_I = 4.0, 40.0
 """Gains of speed control in wheel mode: duty per speed error, as a fraction of the no-load speed, and per
@@ -45,56 +55,43 @@ class JointShaft(Shaft):
         self._turns_apart = 0.0
         """Whole turns between the shaft's angle and the turn in which joint mode counts, rad."""
         self._aimed: tuple[int, int, int] = (0, 0, 0)
-        self._reach = memory.table.max_tick * memory.table.rad_per_tick
+        self.state.highest_tick = memory.table.max_tick
+        self.state.noticed_speed = memory.table.rad_s_per_tick / 2
+        memory.watch_items(_OF_COUNTING, self._count)
 
     def within_a_turn(self, angle: float) -> float:
         """Return the angle unchanged: at power-up these servos show the same angle as before."""
         return angle
 
-    def position_tick(self, angle: float) -> int:
-        """Return the value of Present Position for an angle of the shaft, rad; beyond the range the
-        nearest end [i]."""
-        table = self.memory.table
-        if multi_turn_mode(self.memory):
-            tick = round(angle / table.rad_per_tick / self.memory["resolution_divider"])
-            return tick + self.memory.ticks("multi_turn_offset") & 0xFFFF  # In two's complement
-        if wheel_mode(self.memory):
-            angle = in_turn(angle)
-        else:
-            angle = in_turn(angle - self._whole_turns(angle)) if angle > math.tau or angle < -1 else angle
-        tick = round(angle / table.rad_per_tick)
-        if tick > table.max_tick and wheel_mode(self.memory):
-            dead_zone = math.tau / table.rad_per_tick - table.max_tick
-            return table.max_tick if tick - table.max_tick < dead_zone / 2 else 0
-        return max(0, min(table.max_tick, tick))
-
-    def live(self) -> Mapping[str, Callable[[], int]]:
-        """Return the items that show the motion, each with a function for its present value, the integer
-        on the wire."""
-        return {
-            # Negative turns, as in goals
-            "present_position": lambda: self.position_tick(self.angle) & 0xFFFF,
-            "present_speed": self._present_speed,
-            "present_load": self._present_load,
-            "moving": lambda: int(self.moving),
-            "current": lambda: self._present_current("current"),
-            "sensed_current": lambda: self._present_current("sensed_current"),
-        }
-
-    def _present_speed(self) -> int:
-        table = self.memory.table
+    def live_items(self) -> Mapping[str, LiveItem]:
+        """Return the items that show the motion; load and speed have the direction in bit 10."""
+        table, items = self.memory.table, self.memory.table.items
         unit = table.rad_s_per_tick
         if wheel_mode(self.memory) and not self._controls_speed:
             unit = table.max_speed / table.max_speed_tick
-        return _sign_magnitude(self.velocity / unit, table.max_speed_tick)
+        load = items["present_load"].scale
+        live = {
+            "present_position": LiveItem(ShownQuantity.POSITION),
+            "present_speed": LiveItem(
+                ShownQuantity.VELOCITY, unit, highest=table.max_speed_tick, sign_bit=10
+            ),
+            "present_load": LiveItem(ShownQuantity.DUTY, load, highest=1023, sign_bit=10),
+            "moving": LiveItem(ShownQuantity.MOVING),
+        }
+        for name in _MID_OF_CURRENT.keys() & items.keys():
+            scale, lowest, highest = items[name].scale, items[name].minimum, items[name].maximum
+            zero = _MID_OF_CURRENT[name]
+            live[name] = LiveItem(ShownQuantity.CURRENT, scale, zero=zero, lowest=lowest, highest=highest)
+        return live
 
-    def _present_load(self) -> int:
-        fraction = self.memory.table.items["present_load"].scale
-        return _sign_magnitude(self.duty / fraction, 1023)
-
-    def _present_current(self, name: str) -> int:
-        item = self.memory.table.items[name]
-        return max(item.minimum, min(item.maximum, _MID_OF_CURRENT[name] + round(self.current / item.scale)))
+    def _count(self) -> None:
+        """Let Present Position count as the mode requires."""
+        memory, state = self.memory, self.state
+        one_turn = Counting.WHEEL if wheel_mode(memory) else Counting.JOINT
+        state.counting = Counting.TURNS if multi_turn_mode(memory) else one_turn
+        state.divider = memory.get("resolution_divider", 1)
+        state.offset = memory.ticks("multi_turn_offset") if "multi_turn_offset" in memory else 0
+        self.show_items()
 
     @property
     def _controls_speed(self) -> bool:
@@ -104,23 +101,13 @@ class JointShaft(Shaft):
     def _controls_position(self) -> bool:
         return not wheel_mode(self.memory) and not self.memory.get("torque_ctrl_mode_enable")
 
-    @property
-    def _noticed_speed(self) -> float:
-        return self.memory.table.rad_s_per_tick / 2
-
-    def _whole_turns(self, angle: float) -> float:
-        """Return the whole turns in an angle, rad; an angle slightly outside the range of joint mode
-        counts as inside."""
-        outside = max(math.tau - self._reach, 0.1) / 2
-        return math.tau * math.floor((angle + outside) / math.tau)
-
     def _new_trajectory(self, *, afresh: bool = False) -> Trajectory | None:
         memory, table = self.memory, self.memory.table
         aimed = (memory["goal_position"], memory["moving_speed"], memory.get("goal_acceleration"))
         if aimed == self._aimed and not afresh:
             return None
         if afresh:
-            self._turns_apart = self._whole_turns(self.angle)
+            self._turns_apart = self._library.motion_whole_turns(self.address, self.angle)
         self._aimed = aimed
         if multi_turn_mode(memory):
             signed = aimed[0] - (aimed[0] >> 15 << 16)
@@ -191,8 +178,3 @@ def _slope(value: int) -> int:
 
     e-Manual, AX-12A, Compliance Slope (28): "7 steps"."""
     return min(128, 1 << max(1, value.bit_length() - 1))
-
-
-def _sign_magnitude(ticks: float, limit: int) -> int:
-    magnitude = min(limit, round(abs(ticks)))
-    return magnitude | 1 << 10 if ticks < 0 and magnitude else magnitude

@@ -9,6 +9,8 @@
  * same law on the integrated speed: its I gain takes the place of P, its P gain that of D. The motor's torque is
  * `duty * stall torque - damping * velocity`.
  *
+ * `motion_show` writes the motion into the registers of a servo, in ticks.
+ *
  * Arithmetic is IEEE double in source order, built with -ffp-contract=off, so that a simulation has the same bits on
  * every machine with the same `sin`, `exp` and `pow`. NaN spreads through `least` and `most`, as in numpy.
  */
@@ -26,8 +28,16 @@
 #define STILL 1e-6      /* rad/s; a servo rests below it, and below UNDRIVEN */
 #define UNDRIVEN 1e-8   /* rad/s, change of the speed in a step */
 #define STEADY_C 1e-7   /* degrees C in a tick; a smaller change has no visible effect in years */
+#define TAU 6.283185307179586
+#define NEAR_TICKS 10   /* distance that counts as "in position"; the manual of the X series gives no value [i] */
+#define IN_POSITION 1   /* bits of Moving Status (123) */
+#define ON_THE_WAY 2
 
 enum { DONE, ACTION, STRAINED, STEP }; /* results of motion_step_to: `StepResult` of compiled_mechanics.py */
+
+/* Quantities that registers show, and how positions are counted: `ShownQuantity` and `Counting` of compiled_mechanics.py */
+enum { POSITION, VELOCITY, SETPOINT, SETPOINT_VELOCITY, DUTY, CURRENT, MOVING, MOVING_STATUS, TEMPERATURE, VOLTAGE, TIME };
+enum { ENDLESS, JOINT, WHEEL, TURNS };
 
 typedef struct { /* one servo: its command, trajectory, controller, motor and temperature; angles are the shaft's */
     double goal, speed, acceleration, turning, p_ccw, p_cw, margin_ccw, margin_cw, punch; /* ServoCommand of */
@@ -76,6 +86,30 @@ typedef struct {
     int32_t calm;           /* 1: the same load would change no temperature any more */
     int32_t news;           /* 1: a servo has `news` */
 } Mechanics;
+
+typedef struct { /* register that shows a quantity, rounded to ticks */
+    double times, unit;            /* ticks = quantity * times / unit */
+    int64_t zero, lowest, highest; /* ticks at 0, and the range of the register */
+    int32_t quantity, address, size;
+    int32_t sign_bit;              /* bit of a negative sign, which limits the magnitude to `highest`; -1: none */
+} LiveItem;
+
+typedef struct { /* shaft of one servo, as its registers show it */
+    const Mechanics *mechanics;
+    uint8_t *memory;               /* registers */
+    const LiveItem *items;
+    int64_t item_count, index;     /* `index`: of the servo in the mechanics */
+    int64_t now_ns, started_ns;    /* time of the servo, and of its start */
+    int64_t offset, highest_tick;  /* ticks: of the position, and its end in joint and wheel mode */
+    double sign;                   /* -1: clockwise is positive */
+    double rad_per_tick, divider;  /* of the position, and of TURNS alone */
+    double noticed_speed;          /* rad/s from which the shaft counts as moving */
+    double torque_per_ampere;      /* Nm/A */
+    double voltage, supply_ohm;    /* V of the supply without load, and the resistance of its cable */
+    int32_t counting;
+    int32_t goes_to_goal, turns;   /* 1: the command has a goal; 1: it has a speed */
+    int32_t profile_kind;          /* bits of Moving Status */
+} Shaft;
 
 uint32_t dxl_source(void)
 {
@@ -199,7 +233,8 @@ void motion_drive(Mechanics *m)
     }
 }
 
-int32_t motion_at_goal(const Servo *s)
+/* Return true if a trajectory has ended; with a speed command, if that speed is reached. */
+static int at_goal(const Servo *s)
 {
     return s->turning != 0.0 ? s->setpoint_velocity == s->speed : fabs(s->goal - s->setpoint) < ARRIVED;
 }
@@ -209,7 +244,7 @@ static void check_arrival(Mechanics *m)
 {
     for (int64_t i = 0; i < m->count; i++) {
         const Servo *s = &m->servos[i];
-        if (s->turning != 0.0 || !motion_at_goal(s) || !(fabs(s->setpoint_velocity) < ARRIVED / m->step_s))
+        if (s->turning != 0.0 || !at_goal(s) || !(fabs(s->setpoint_velocity) < ARRIVED / m->step_s))
             return;
     }
     for (int64_t i = 0; i < m->count; i++) {
@@ -314,4 +349,132 @@ int32_t motion_step_to(Mechanics *m, int64_t now_ns)
             return STRAINED;
     }
     return DONE;
+}
+
+/* Angle of the shaft at the servo's time, rad from raw 0, including turns, without Homing Offset and reversal. */
+double motion_angle(const Shaft *s)
+{
+    const Mechanics *m = s->mechanics;
+    int64_t ahead_ns = s->now_ns - m->grid_ns;
+    double angle = m->angle[s->index];
+    return ahead_ns > 0 ? angle + m->velocity[s->index] * (double)ahead_ns * 1e-9 : angle;
+}
+
+static double setpoint_velocity(const Shaft *s)
+{
+    return s->goes_to_goal || s->turns ? s->mechanics->servos[s->index].setpoint_velocity : 0.0;
+}
+
+static double setpoint(const Shaft *s)
+{
+    int64_t ahead_ns = s->now_ns - s->mechanics->grid_ns;
+    if (!s->goes_to_goal)
+        return motion_angle(s);
+    return s->mechanics->servos[s->index].setpoint + setpoint_velocity(s) * ((double)(ahead_ns > 0 ? ahead_ns : 0) * 1e-9);
+}
+
+static int is_under_way(const Shaft *s)
+{
+    return s->goes_to_goal && !at_goal(&s->mechanics->servos[s->index]);
+}
+
+/* Return 1 while the shaft's trajectory moves, or while its speed exceeds the threshold. */
+int32_t motion_is_moving(const Shaft *s)
+{
+    return is_under_way(s) || fabs(s->mechanics->velocity[s->index]) > s->noticed_speed;
+}
+
+static int32_t moving_status(const Shaft *s)
+{
+    if (!s->goes_to_goal)
+        return motion_is_moving(s) ? 0 : IN_POSITION;
+    if (is_under_way(s))
+        return s->profile_kind | ON_THE_WAY;
+    double left = fabs(s->mechanics->servos[s->index].setpoint - motion_angle(s));
+    return s->profile_kind | (left <= NEAR_TICKS * s->rad_per_tick ? IN_POSITION : 0);
+}
+
+/* Return the whole turns in an angle, rad; an angle slightly outside the range of joint mode counts as inside. */
+double motion_whole_turns(const Shaft *s, double angle)
+{
+    double outside = most(TAU - (double)s->highest_tick * s->rad_per_tick, 0.1) / 2;
+    return TAU * floor((angle + outside) / TAU);
+}
+
+static double in_turn(double angle)
+{
+    if (angle >= 0.0 && angle < TAU)
+        return angle;
+    double left = fmod(angle, TAU);
+    return left < 0.0 ? left + TAU : left;
+}
+
+/* Return the value of Present Position for an angle of the shaft, rad. Beyond the range of joint mode it is the nearest
+ * end [i]. */
+double motion_position_tick(const Shaft *s, double angle)
+{
+    double highest = (double)s->highest_tick, offset = (double)s->offset;
+    if (s->counting == ENDLESS)
+        return rint(s->sign * angle / s->rad_per_tick) + offset;
+    if (s->counting == TURNS) { /* in two's complement */
+        double tick = fmod(rint(angle / s->rad_per_tick / s->divider) + offset, 65536.0);
+        return tick < 0.0 ? tick + 65536.0 : tick;
+    }
+    if (s->counting == WHEEL)
+        angle = in_turn(angle);
+    else if (angle > TAU || angle < -1.0)
+        angle = in_turn(angle - motion_whole_turns(s, angle));
+    double tick = rint(angle / s->rad_per_tick);
+    if (s->counting == WHEEL && tick > highest) /* in the dead zone */
+        return tick - highest < (TAU / s->rad_per_tick - highest) / 2 ? highest : 0.0;
+    return most(least(tick, highest), 0.0);
+}
+
+static double quantity(const Shaft *s, int32_t which)
+{
+    const Mechanics *m = s->mechanics;
+    const Servo *servo = &m->servos[s->index];
+    double current = servo->torque / s->torque_per_ampere; /* A, positive when it drives counter-clockwise */
+    switch (which) {
+    case VELOCITY: return s->sign * m->velocity[s->index];
+    case SETPOINT_VELOCITY: return s->sign * setpoint_velocity(s);
+    case DUTY: return s->sign * servo->duty;
+    case CURRENT: return s->sign * current;
+    case MOVING: return motion_is_moving(s);
+    case MOVING_STATUS: return moving_status(s);
+    case TEMPERATURE: return servo->temperature;
+    case VOLTAGE: return s->voltage - s->supply_ohm * fabs(servo->duty * current);
+    default: return (double)((s->now_ns - s->started_ns) / 1000000 % 32768); /* ms */
+    }
+}
+
+static int64_t shown(const Shaft *s, const LiveItem *item)
+{
+    double ticks;
+    if (item->quantity == POSITION || item->quantity == SETPOINT)
+        ticks = motion_position_tick(s, item->quantity == POSITION ? motion_angle(s) : setpoint(s));
+    else
+        ticks = rint(quantity(s, item->quantity) * item->times / item->unit) + (double)item->zero;
+    double highest = (double)item->highest;
+    if (item->sign_bit >= 0) {
+        int64_t magnitude = (int64_t)least(fabs(ticks), highest);
+        return ticks < 0.0 && magnitude ? magnitude | (int64_t)1 << item->sign_bit : magnitude;
+    }
+    return (int64_t)most(least(ticks, highest), (double)item->lowest);
+}
+
+/* Write the motion at `now_ns` into those registers that show it and have a byte in a range of addresses. The mechanics
+ * must have been stepped to this time. */
+void motion_show(Shaft *s, int64_t now_ns, int32_t address, int32_t length)
+{
+    if (now_ns > s->now_ns)
+        s->now_ns = now_ns;
+    for (int64_t i = 0; i < s->item_count; i++) {
+        const LiveItem *item = &s->items[i];
+        if (item->address >= address + length || address >= item->address + item->size)
+            continue;
+        int64_t value = shown(s, item);
+        for (int32_t byte = 0; byte < item->size; byte++)
+            s->memory[item->address + byte] = (uint8_t)(value >> 8 * byte);
+    }
 }

@@ -87,7 +87,8 @@ class Mechanics:
             overload_ticks=OVERLOAD_TICKS,
         )
         self._library = library()
-        self._address = ctypes.addressof(self._state)
+        self.address = ctypes.addressof(self._state)
+        """Address of the struct `Mechanics` of mechanics.c."""
         self.servos = np.zeros(0, dtype=SERVO)
         """Struct `Servo` of mechanics.c for each servo: command, setpoint, torque (Nm), duty, temperature
         (degrees C)."""
@@ -163,10 +164,6 @@ class Mechanics:
         servo = self.servos[index]
         servo["goal"], servo["speed"], servo["acceleration"] = goal, speed, acceleration
         self._wake()
-
-    def at_goal(self, index: int) -> bool:
-        """Return True if a servo's trajectory has ended; with a speed command, if that speed is reached."""
-        return bool(self._library.motion_at_goal(self._state.servos + index * SERVO.itemsize))
 
     def move_shaft(self, index: int, angle: float) -> None:
         """Move a resting shaft to an angle, rad, at once; its trajectory begins there."""
@@ -250,7 +247,7 @@ class Mechanics:
 
     def step_to(self, now_ns: int) -> None:
         """Step all servos up to the last grid point at or before `now_ns`."""
-        while (answer := self._library.motion_step_to(self._address, now_ns)) != StepResult.DONE:
+        while (answer := self._library.motion_step_to(self.address, now_ns)) != StepResult.DONE:
             self._state.busy = True  # Callbacks may read the time, but must not advance it
             try:
                 if answer == StepResult.ACTION:
@@ -278,9 +275,9 @@ class Mechanics:
         """Take one step of a plant that is not in C, or one in which shafts that are turned by hand follow
         the hand, unless the servo drives them."""
         angles = {index: self.plant.angle.item(index) for index in self._hands}
-        self._library.motion_drive(self._address)
+        self._library.motion_drive(self.address)
         self.plant.step_shafts(self._drive, self._damping, self._state.step_s)
-        self._library.motion_check_rest(self._address)
+        self._library.motion_check_rest(self.address)
         for index, angle in angles.items():
             hand, way = self._hands[index], self._hands[index].speed * STEP_NS * 1e-9
             if self._drives(index):
@@ -294,7 +291,7 @@ class Mechanics:
             else:
                 del self._hands[index]
         self._state.hands = len(self._hands)
-        self._library.motion_end_step(self._address)
+        self._library.motion_end_step(self.address)
 
     def _drives(self, index: int) -> bool:
         """Return True if a servo is commanded to a position, a speed, or a torque other than 0."""

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
+from dxlsim.motion.compiled_mechanics import ShownQuantity
 from dxlsim.motion.control_law import FREE, LIMP, ServoCommand
 from dxlsim.motion.mechanics import Mechanics
 from dxlsim.motion.motor import Motor
-from dxlsim.motion.shaft import Shaft, Trajectory, critical_d
+from dxlsim.motion.shaft import LiveItem, Shaft, Trajectory, critical_d
 from dxlsim.registers.access import ACCESS, OperatingMode, watchdog_expired
 from dxlsim.registers.memory import Memory
 from dxlsim.simulation_plan import Load
@@ -23,11 +24,7 @@ _OF_POSITION = (
 )
 
 _RECTANGULAR, _TRIANGULAR, _TRAPEZOIDAL = 0x10, 0x20, 0x30
-_ARRIVED, _ON_THE_WAY = 0x01, 0x02
-"""Bits of Moving Status (123): kind of the profile; in position; profile in progress."""
-
-# Distance that counts as "in position"; the manual of the X series gives no value [i]
-_IN_POSITION_TICKS = 10
+"""Bits of Moving Status (123): kind of the profile."""
 
 
 SAMPLING_S = 1e-3
@@ -59,7 +56,6 @@ class ModeShaft(Shaft):
     def __init__(self, memory: Memory, mechanics: Mechanics, motor: Motor, load: Load, angle: float) -> None:
         super().__init__(memory, mechanics, motor, load, angle)
         self._aimed: tuple[int, int, int] = (0, 0, 0)
-        self._profile_kind = 0
         items = memory.table.items
         self._speed_item = memory.table.goal_speed_item
         """Name of the item with the profile's speed: on PRO Goal Velocity (600), with Goal Acceleration
@@ -75,6 +71,8 @@ class ModeShaft(Shaft):
         self._rad_per_tick = memory.table.rad_per_tick
         self._sign, self._offset = 1, 0
         memory.watch_items(("drive_mode", "homing_offset", "operating_mode"), self._orient)
+        memory.watch_items(("moving_threshold",), self._set_threshold)
+        self.show_items()
 
     def within_a_turn(self, angle: float) -> float:
         """Return the angle, rad, that the servo shows after power-up: within one turn of its encoder, 0 to
@@ -86,49 +84,21 @@ class ModeShaft(Shaft):
         half = self.memory.table.rad_per_tick / 2
         return self._sign * (shown - math.tau * math.floor((shown + half) / math.tau))
 
-    def position_tick(self, angle: float) -> int:
-        """Return the value of Present Position, ticks, for an angle of the shaft, rad."""
-        tick = round(self._sign * angle / self._rad_per_tick)
-        return tick + self._offset
-
-    def live(self) -> Mapping[str, Callable[[], int]]:
-        """Return the items that show the motion, each with a function for its present value in ticks."""
+    def live_items(self) -> Mapping[str, LiveItem]:
+        """Return the items that show the motion."""
+        scale = self._scale
+        velocity, trajectory = scale.get("present_velocity", 1.0), scale.get("velocity_trajectory", 1.0)
         return {
-            "present_position": lambda: self.position_tick(self.angle),
-            "present_velocity": lambda: self._velocity_tick("present_velocity", self.velocity),
-            "position_trajectory": lambda: self.position_tick(self._trajectory_angle),
-            "velocity_trajectory": lambda: self._velocity_tick("velocity_trajectory", self._trajectory_speed),
-            "present_load": lambda: round(self._sign * self.duty * 1000),  # Unit 0.1 %, like the output
-            "present_current": lambda: round(self._sign * self.current / self._current_unit),
-            "present_pwm": lambda: round(self._sign * self.duty / self._pwm_unit),
-            "moving": lambda: int(self.moving),
-            "moving_status": self._moving_status,
+            "present_position": LiveItem(ShownQuantity.POSITION),
+            "present_velocity": LiveItem(ShownQuantity.VELOCITY, velocity),
+            "position_trajectory": LiveItem(ShownQuantity.SETPOINT),
+            "velocity_trajectory": LiveItem(ShownQuantity.SETPOINT_VELOCITY, trajectory),
+            "present_load": LiveItem(ShownQuantity.DUTY, times=1000),  # Unit 0.1 %, like the output
+            "present_current": LiveItem(ShownQuantity.CURRENT, self._current_unit),
+            "present_pwm": LiveItem(ShownQuantity.DUTY, self._pwm_unit),
+            "moving": LiveItem(ShownQuantity.MOVING),
+            "moving_status": LiveItem(ShownQuantity.MOVING_STATUS),
         }
-
-    def _velocity_tick(self, name: str, velocity: float) -> int:
-        return round(self._sign * velocity / self._scale[name])
-
-    @property
-    def _trajectory_angle(self) -> float:
-        if not self._goes_to_goal:
-            return self.angle
-        ahead_s = max(0, self.now_ns - self.mechanics.grid_ns) * 1e-9
-        setpoint: float = self.mechanics.servos["setpoint"].item(self.index)
-        return setpoint + self._trajectory_speed * ahead_s
-
-    @property
-    def _trajectory_speed(self) -> float:
-        speed = self.mechanics.servos["setpoint_velocity"].item(self.index)
-        return speed if self._goes_to_goal or (self._last and self._last.turning) else 0.0
-
-    def _moving_status(self) -> int:
-        if not self._goes_to_goal:
-            return _ARRIVED if not self.moving else 0
-        if self._under_way:
-            return self._profile_kind | _ON_THE_WAY
-        goal = self.mechanics.servos["setpoint"].item(self.index)
-        near = abs(goal - self.angle) <= _IN_POSITION_TICKS * self.memory.table.rad_per_tick
-        return self._profile_kind | (_ARRIVED if near else 0)
 
     def _orient(self) -> None:
         self._sign = -1 if self.memory.get("drive_mode") & REVERSE else 1
@@ -137,15 +107,15 @@ class ModeShaft(Shaft):
         ignored = abs(self._offset) * self._rad_per_tick > math.pi / 2 + 1e-9
         if ignored and self.memory.get("operating_mode") == OperatingMode.POSITION:
             self._offset = 0
+        self.state.sign, self.state.offset = self._sign, self._offset
+
+    def _set_threshold(self) -> None:
+        threshold = self.memory.get("moving_threshold", 1)
+        self.state.noticed_speed = max(threshold, 0.5) * self.memory.table.rad_s_per_tick
 
     @property
     def _controls_position(self) -> bool:
         return self.memory["operating_mode"] in _OF_POSITION
-
-    @property
-    def _noticed_speed(self) -> float:
-        threshold = self.memory.get("moving_threshold", 1)
-        return max(threshold, 0.5) * self.memory.table.rad_s_per_tick
 
     def _command(self) -> ServoCommand:
         memory, mode = self.memory, self.memory["operating_mode"]
@@ -215,14 +185,14 @@ class ModeShaft(Shaft):
         self._aimed = aimed
         goal = self._sign * (memory.ticks("goal_position") - self._offset) * table.rad_per_tick
         if not velocity:
-            self._profile_kind = 0
+            self.state.profile_kind = 0
             return goal, FREE, FREE
         distance = abs(goal - self.mechanics.servos["setpoint"].item(self.index))
         if memory.get("drive_mode") & TIME_BASED:
             return self._timed(goal, distance, velocity * 1e-3, ramp * 1e-3)
         speed = velocity * table.rad_s_per_tick
         acceleration = ramp * self._acceleration_unit or FREE
-        self._profile_kind = _kind(ramp, distance, speed, acceleration)
+        self.state.profile_kind = _kind(ramp, distance, speed, acceleration)
         return goal, speed, acceleration
 
     def _timed(self, goal: float, distance: float, duration: float, ramp: float) -> Trajectory:
@@ -233,7 +203,7 @@ class ModeShaft(Shaft):
         ramp = min(ramp, duration / 2)
         speed = distance / (duration - ramp)
         acceleration = speed / ramp if ramp else FREE
-        self._profile_kind = _kind(ramp, distance, speed, acceleration)
+        self.state.profile_kind = _kind(ramp, distance, speed, acceleration)
         return goal, speed, acceleration
 
     def _profile(self, name: str) -> int:

@@ -3,21 +3,35 @@ registers."""
 
 from __future__ import annotations
 
+import ctypes
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
+from dxlsim.motion.compiled_mechanics import STRUCTS, ShownQuantity, library
 from dxlsim.motion.control_law import LIMP, ServoCommand
-from dxlsim.motion.mechanics import STEP_NS, Mechanics
+from dxlsim.motion.mechanics import STEP_NS, SUPPLY_OHM, Mechanics
 from dxlsim.motion.motor import Motor
 from dxlsim.registers.access import ShaftItems
-from dxlsim.registers.memory import Memory
+from dxlsim.registers.memory import Memory, value_range
 from dxlsim.simulation_plan import Load
 
 Trajectory = tuple[float, float, float]
 """Goal of a move, rad of the shaft, and the profile's speed, rad/s, and acceleration, rad/s^2."""
+
+
+class LiveItem(NamedTuple):
+    """Item that shows the motion: `quantity * times / unit`, rounded to ticks, plus `zero`."""
+
+    quantity: ShownQuantity
+    unit: float = 1.0
+    times: float = 1.0
+    zero: int = 0
+    lowest: int | None = None  # Range of the ticks; None: that of the register
+    highest: int | None = None
+    sign_bit: int = -1  # Bit of a negative sign; -1: in two's complement, or unsigned
 
 
 class Shaft(ABC):
@@ -32,7 +46,21 @@ class Shaft(ABC):
         self.motor = motor
         self._torque_per_ampere = self.motor.torque_per_ampere
         self.index = mechanics.add_servo(self.motor, load, angle)
-        self.now_ns = mechanics.grid_ns
+        self._library = library()
+        self.state = STRUCTS["Shaft"](
+            mechanics=mechanics.address,
+            memory=ctypes.addressof(memory.image),
+            index=self.index,
+            now_ns=mechanics.grid_ns,
+            started_ns=mechanics.grid_ns,
+            sign=1.0,
+            rad_per_tick=memory.table.rad_per_tick,
+            divider=1.0,
+            torque_per_ampere=motor.torque_per_ampere,
+            supply_ohm=SUPPLY_OHM,
+        )
+        """Struct `Shaft` of mechanics.c: how the registers show the motion."""
+        self.address = ctypes.addressof(self.state)
         self._last: ServoCommand | None = None
         self._goes_to_goal = False
         self.response_delay_ns = 0  # Delay until a command takes effect; torque off has none
@@ -42,9 +70,8 @@ class Shaft(ABC):
     def angle(self) -> float:
         """Angle of the shaft at the servo's time, rad from raw 0, including turns, without Homing Offset
         and reversal."""
-        plant, ahead_ns = self.mechanics.plant, self.now_ns - self.mechanics.grid_ns
-        angle: float = plant.angle.item(self.index)
-        return angle + plant.velocity.item(self.index) * ahead_ns * 1e-9 if ahead_ns > 0 else angle
+        angle: float = self._library.motion_angle(self.address)
+        return angle
 
     @property
     def velocity(self) -> float:
@@ -66,7 +93,54 @@ class Shaft(ABC):
     @property
     def moving(self) -> bool:
         """True while the shaft's trajectory moves, or while its speed exceeds the threshold."""
-        return self._under_way or abs(self.velocity) > self._noticed_speed
+        return bool(self._library.motion_is_moving(self.address))
+
+    @property
+    def now_ns(self) -> int:
+        """Time of the servo, ns."""
+        now_ns: int = self.state.now_ns
+        return now_ns
+
+    @property
+    def _goes_to_goal(self) -> bool:
+        return bool(self.state.goes_to_goal)
+
+    @_goes_to_goal.setter
+    def _goes_to_goal(self, goes: bool) -> None:
+        self.state.goes_to_goal = goes
+
+    def show_items(self) -> None:
+        """Take the items that show the motion from `live_items`; call it again after one has changed."""
+        items = self.memory.table.items
+        common = {
+            "realtime_tick": LiveItem(ShownQuantity.TIME),
+            "present_temperature": LiveItem(ShownQuantity.TEMPERATURE),
+            "present_inverter_temperature": LiveItem(ShownQuantity.TEMPERATURE),
+            "present_motor_temperature": LiveItem(ShownQuantity.TEMPERATURE),
+        }
+        for name in {"present_voltage", "present_input_voltage"} & items.keys():
+            common[name] = LiveItem(ShownQuantity.VOLTAGE, items[name].scale)
+        known = {name: live for name, live in {**common, **self.live_items()}.items() if name in items}
+        self._items = (STRUCTS["LiveItem"] * len(known))()
+        for struct, (name, live) in zip(self._items, known.items(), strict=True):
+            lowest, highest = value_range(items[name])
+            struct.quantity, struct.unit, struct.times, struct.zero = live[:4]
+            struct.lowest = lowest if live.lowest is None else live.lowest
+            struct.highest = highest if live.highest is None else live.highest
+            struct.sign_bit, struct.address, struct.size = (
+                live.sign_bit,
+                items[name].address,
+                items[name].size,
+            )
+        self.state.items, self.state.item_count = ctypes.addressof(self._items), len(known)
+
+    def show_range(self, address: int, length: int) -> None:
+        """Write the motion at the servo's time into the registers of a range."""
+        self._library.motion_show(self.address, 0, address, length)
+
+    def position_tick(self, angle: float) -> int:
+        """Return the value of Present Position, ticks, for an angle of the shaft, rad."""
+        return int(self._library.motion_position_tick(self.address, angle))
 
     @property
     def torque_on(self) -> bool:
@@ -83,11 +157,12 @@ class Shaft(ABC):
         self._withdrawn += 1
         self._last = None
         self._goes_to_goal = False
+        self.state.turns = False
 
     def advance_to(self, now_ns: int) -> None:
         """Advance the shaft's time and the mechanics to `now_ns`; an earlier time is ignored."""
         if now_ns > self.now_ns:
-            self.now_ns = now_ns
+            self.state.now_ns = now_ns
             if now_ns - self.mechanics.grid_ns >= STEP_NS:
                 self.mechanics.step_to(now_ns)
 
@@ -107,6 +182,7 @@ class Shaft(ABC):
             command = command._replace(goal=goal, speed=speed, acceleration=acceleration)
         if command != self._last:
             self._last = command
+            self.state.turns = command.turning != 0.0
             if command.limit == 0.0:
                 self._withdrawn += 1
                 self.mechanics.command_servo(self.index, command)
@@ -137,12 +213,8 @@ class Shaft(ABC):
         """Return the angle, rad, that the servo shows after power-up, when it has lost its count of turns."""
 
     @abstractmethod
-    def position_tick(self, angle: float) -> int:
-        """Return the value of Present Position for an angle of the shaft, rad."""
-
-    @abstractmethod
-    def live(self) -> Mapping[str, Callable[[], int]]:
-        """Return the items that show the motion, each with a function for its present value."""
+    def live_items(self) -> Mapping[str, LiveItem]:
+        """Return the items that show the motion; names that the model lacks are ignored."""
 
     @abstractmethod
     def _command(self) -> ServoCommand:
@@ -153,23 +225,10 @@ class Shaft(ABC):
     @abstractmethod
     def _controls_position(self) -> bool: ...
 
-    @property
-    @abstractmethod
-    def _noticed_speed(self) -> float: ...
-
     @abstractmethod
     def _new_trajectory(self, *, afresh: bool = False) -> Trajectory | None:
         """Return the trajectory that the registers ask for, or None if it has not changed; `afresh`:
         return it in any case."""
-
-    @property
-    def _under_way(self) -> bool:
-        return self._goes_to_goal and not self.mechanics.at_goal(self.index)
-
-
-def in_turn(angle: float) -> float:
-    """Return the angle, rad, plus or minus whole turns, between 0 and a whole turn."""
-    return angle if 0 <= angle < math.tau else angle % math.tau
 
 
 def critical_d(p: float, motor: Motor) -> float:

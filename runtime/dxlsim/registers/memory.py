@@ -64,6 +64,8 @@ class Memory:
         self._readers = {item.name: _reader(item, self._memory) for item in table.items.values()}
         self._watchers: dict[str, list[Callable[[], None]]] = {}
         self._live: dict[str, Callable[[], int]] = {}
+        self.show_range: Callable[[int, int], object] = _show_nothing
+        """Sets the registers of a range (address, length) that show the motion of a shaft."""
         self.restore_factory_values()
 
     def restore_factory_values(self, keep: tuple[str, ...] = ()) -> None:
@@ -132,6 +134,7 @@ class Memory:
 
     def refresh(self) -> None:
         """Set all live items to their present values."""
+        self.show_range(0, self.size)
         for name, show in self._live.items():
             self.show_value(name, show())
 
@@ -149,9 +152,11 @@ class Memory:
         """Set the live items in a range, or at the targets of its Indirect Data, to their present values."""
         cells = self.cells(address, length)
         if cells.direct:
+            self.show_range(address, length)
             self._refresh(cells)
             return
         for target, first, last in self.places(address, length):
+            self.show_range(target, last - first)
             self._refresh(self.cells(target, last - first))
 
     def _refresh(self, cells: Cells) -> None:
@@ -254,12 +259,21 @@ def signed(item: ControlItem, wire: int) -> int:
     return wire - (wire >> 8 * item.size - 1 << 8 * item.size) if item.signed else wire
 
 
+def value_range(item: ControlItem) -> tuple[int, int]:
+    """Return the range of an item's bytes, as a signed integer if the item is signed."""
+    bits = 8 * item.size - item.signed
+    return (-1 << bits if item.signed else 0), (1 << bits) - 1
+
+
 def _place(item: ControlItem) -> tuple[int, int, int, int, int]:
     """Return (start, end, bit mask, lowest, highest) of an item: its addresses, and the range of its
     bytes."""
-    bits = 8 * item.size - item.signed
-    lowest = -1 << bits if item.signed else 0
-    return item.address, item.address + item.size, (1 << 8 * item.size) - 1, lowest, (1 << bits) - 1
+    mask = (1 << 8 * item.size) - 1
+    return item.address, item.address + item.size, mask, *value_range(item)
+
+
+def _show_nothing(address: int, length: int) -> None:
+    """Do nothing: a device has no shaft."""
 
 
 _FORMATS = {1: "<B", 2: "<H", 4: "<I"}

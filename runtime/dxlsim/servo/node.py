@@ -62,8 +62,12 @@ class SimulatedNode(ABC):
         """State of the node that the line uses: its ID and rate, when it receives, how it replies."""
         self._contacts: list[Callable[[], bool]] = []
         """Functions that return True if the cable has contact when an instruction arrives; all must."""
-        memory.show_live(self._live_items())
         memory.watch_items(("return_delay_time",), self._set_delay)
+
+    def show_live(self, live: Mapping[str, Callable[[], int]]) -> None:
+        """Let functions provide the values of items, also of those that show the motion."""
+        self.registers.show_live(live)
+        self.line.show = None
 
     @property
     def called(self) -> str:
@@ -172,11 +176,6 @@ class SimulatedNode(ABC):
     @abstractmethod
     def advance_to(self, now_ns: int) -> None:
         """Advance the node to `now_ns`; an earlier time is ignored."""
-
-    @abstractmethod
-    def _live_items(self) -> Mapping[str, Callable[[], int]]:
-        """Return the items that show present values, each with the function that returns the integer on
-        the wire."""
 
     @abstractmethod
     def apply_protection(self, refused: int = 0) -> None:

@@ -286,7 +286,7 @@ class Protocol2Servo(SimulatedServo):
     def _start_up(self) -> None:
         registers = self.registers
         self._shut_down = False
-        self._started_ns = self.line.received_ns = self.shaft.now_ns
+        self.shaft.state.started_ns = self.line.received_ns = self.shaft.now_ns
         if "torque_limit" in registers and "max_torque" in registers:
             registers["torque_limit"] = registers["max_torque"]
         registers.show_value("backup_ready", bool(self._backup))

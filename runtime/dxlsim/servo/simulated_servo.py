@@ -12,9 +12,9 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
-from dxlsim.motion.mechanics import SUPPLY_OHM
+from dxlsim.motion.compiled_mechanics import function_address
 from dxlsim.motion.shaft import Shaft
 from dxlsim.registers.access import ErrorOf, lock_error
 from dxlsim.registers.memory import Memory
@@ -41,9 +41,10 @@ class SimulatedServo(SimulatedNode):
         self.boot_ns = BOOT_NS
         """Duration of a reboot or a factory reset by an instruction of Protocol 2.0, ns."""
         self.write_time_ns = 0  # Time without reception after an instruction that writes
-        self._started_ns = shaft.now_ns
         self._registered: tuple[int, bytes] | None = None
         super().__init__(memory, error_of, note, shaft.now_ns)
+        memory.show_range = shaft.show_range
+        self.line.show, self.line.shaft = function_address("show"), shaft.address
         self.line.received_ns = shaft.now_ns
         self._secondary_item = next((each for each in _SECONDARY_IDS if each in memory), None)
         self._voltage = 0.0
@@ -139,21 +140,6 @@ class SimulatedServo(SimulatedNode):
 
     # Effects of time and load
 
-    def _live_items(self) -> Mapping[str, Callable[[], int]]:
-        return {
-            **self.shaft.live(),
-            "present_temperature": lambda: round(self.temperature),
-            "present_inverter_temperature": lambda: round(self.temperature),
-            "present_motor_temperature": lambda: round(self.temperature),
-            "present_voltage": lambda: self._shown_voltage("present_voltage"),
-            "present_input_voltage": lambda: self._shown_voltage("present_input_voltage"),
-            "realtime_tick": lambda: (self.shaft.now_ns - self._started_ns) // 1_000_000 % 32768,
-        }
-
-    def _shown_voltage(self, name: str) -> int:
-        drawn = abs(self.shaft.duty * self.shaft.current)
-        return round((self._voltage - SUPPLY_OHM * drawn) / self.registers.table.items[name].scale)
-
     def _show_errors(self) -> None:
         """Update the error bits of replies that do not depend on registers alone."""
 
@@ -209,7 +195,7 @@ class SimulatedServo(SimulatedNode):
 
     @voltage.setter
     def voltage(self, volts: float) -> None:
-        self._voltage = volts
+        self._voltage = self.shaft.state.voltage = volts
         self.shaft.mechanics.supply(self.shaft.index, volts)
         self._show_errors()
 
@@ -312,7 +298,7 @@ class Protocol1Servo(SimulatedServo):
             self._set("torque_limit", 0)
 
     def _start_up(self) -> None:
-        self._started_ns = self.shaft.now_ns
+        self.shaft.state.started_ns = self.shaft.now_ns
         self.registers["torque_limit"] = self.registers["max_torque"]  # e-Manual, Torque Limit (34)
 
     def _written(self, names: frozenset[str]) -> None:

@@ -86,6 +86,8 @@ typedef struct { /* one servo or device, as the line sees it */
     int32_t group_reads;   /* bits: sync, bulk, fast sync, fast bulk read */
     int32_t least_entries; /* shortest list of a group read that it answers */
     int32_t unused;
+    void (*show)(void *shaft, int64_t now_ns, int32_t address, int32_t length); /* writes the motion into `memory`: */
+    void *shaft;           /* motion_show of mechanics.c; NULL: Python sets registers before they are read */
 } Node;
 
 typedef struct { /* entries of simulated buses, which Python takes in batches */
@@ -138,7 +140,8 @@ typedef struct {
     int64_t now_ns, host_free_ns, end_ns, packets;
     int64_t planned_ns;   /* time of the next planned action; NEVER: none */
     int64_t planned_after; /* number of packets after which the next one runs; NEVER: none */
-    int64_t step_ns;      /* time from which the mechanics have a step to do */
+    int32_t (*step)(void *mechanics, int64_t now_ns); /* motion_step_to of mechanics.c; not 0: Python continues */
+    void *mechanics;
     int64_t timer_ns, delivered;
     int32_t node_count, protocol, baud_rate, bus;
     int32_t plugged, unplugged; /* `unplugged`: number of times */
@@ -1038,7 +1041,7 @@ static int listens_to(const Bus *b, const Node *n, int32_t id)
 /* Advance the mechanics to `now_ns`, if a step is due. */
 static void step_to(Bus *b, int64_t now_ns)
 {
-    if (now_ns >= b->line.step_ns)
+    if (b->line.step(b->line.mechanics, now_ns))
         b->line.call(STEP, now_ns, 0);
 }
 
@@ -1073,6 +1076,33 @@ static void ask(Bus *b, int32_t *count, int32_t node, int32_t address, int32_t l
         b->line.asked = grown(b->line.asked, b->asked_room * (int64_t)sizeof(Asked));
     }
     b->line.asked[(*count)++] = (Asked){node, address, length};
+}
+
+static void show(const Node *n, const Asked *range, int64_t now_ns)
+{
+    int32_t end = range->address + range->length, aliased = 0;
+    for (int32_t at = range->address; at < end; at++)
+        aliased |= n->alias[at] >= 0;
+    if (!aliased)
+        n->show(n->shaft, now_ns, range->address, range->length);
+    else
+        for (int32_t at = range->address; at < end; at++)
+            n->show(n->shaft, now_ns, n->alias[at] < 0 ? at : value_at(n, n->alias[at], 2), 1);
+}
+
+/* Set the registers in the ranges that are about to be read to their present values. */
+static void present(Bus *b, int32_t count, int64_t now_ns)
+{
+    int32_t left = 0;
+    for (int32_t i = 0; i < count; i++) {
+        const Node *n = b->line.nodes[b->line.asked[i].node];
+        if (n->show)
+            show(n, &b->line.asked[i], now_ns);
+        else
+            left = 1;
+    }
+    if (left)
+        b->line.call(PRESENT, count, now_ns);
 }
 
 static int32_t group_read_bit(int32_t instruction)
@@ -1198,8 +1228,7 @@ static void execute_group_read(Bus *b, const Packet *p, int64_t end_ns)
     b->group = ++b->groups;
     b->has_slots = b->line.slots && b->line.protocol == 2 && !is_fast(p->instruction);
     int32_t count = decide_turns(b, p, end_ns);
-    if (count)
-        b->line.call(PRESENT, count, end_ns);
+    present(b, count, end_ns);
     compose_replies(b, is_fast(p->instruction));
     if (b->line.waits)
         b->line.call(CHAIN, end_ns, 0);
@@ -1235,7 +1264,7 @@ static void execute_for(Bus *b, int32_t index, const Packet *p, int64_t end_ns)
         int32_t count = 0, readable = is_readable(n, place.address, place.length);
         error = readable ? 0 : b->line.protocol == 1 ? 0x08 : 7; /* range, access error */
         ask(b, &count, index, place.address, readable ? place.length : 0);
-        b->line.call(PRESENT, 1, end_ns);
+        present(b, 1, end_ns);
         if (error)
             b->line.call(REFUSED, index, error);
         else

@@ -328,9 +328,9 @@ def freeze(story: Story, joint: str, items: str) -> bool:
 
 
 def show(story: Story, joint: str, shown: dict[str, Callable[[], int]]) -> bool:
-    registers = story.servo(joint).registers
-    known = {item: value for item, value in shown.items() if item in registers._live}
-    registers.show_live({**registers._live, **known})
+    servo = story.servo(joint)
+    known = {item: value for item, value in shown.items() if item in servo.registers}
+    servo.show_live({**servo.registers._live, **known})
     return bool(known)
 
 
