@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from enum import Enum, auto, unique
 from typing import Annotated, ClassVar, Final, Literal
 
@@ -20,6 +21,7 @@ from dxlrun import (
     Context,
     Controller,
     Duration,
+    Floats,
     Goal,
     InputError,
     Interfaces,
@@ -142,6 +144,22 @@ class CartesianParameters(ParametersModel):
                 yield ("leader", "joints"), f"{name} is leader and follower; remove one of the two"
 
 
+@dataclass(frozen=True, slots=True)
+class PosePlan:
+    """Message of the topic `plan`: the motion that the command `plan` asked for, and that is not made."""
+
+    x: float
+    """Position of the tip in the base at its end, m."""
+    y: float
+    z: float
+    positions: Floats
+    """Positions of the joints at its end, rad; NaN without a motion."""
+    duration: float
+    """Shortest duration, s; NaN without a motion."""
+    text: str
+    """Reason why there is no motion, or what is not reached."""
+
+
 @unique
 class _Phase(Enum):
     RESTING = auto()
@@ -161,8 +179,9 @@ class CartesianController(Controller[CartesianParameters]):
     """
 
     Parameters = CartesianParameters
-    Commands: ClassVar = {"pose": PoseCommand, "twist": TwistCommand}
+    Commands: ClassVar = {"pose": PoseCommand, "twist": TwistCommand, "plan": PoseCommand}
     Goals = frozenset({"pose"})
+    Topics: ClassVar = {"plan": PosePlan}
 
     @classmethod
     def interfaces(cls, parameters: CartesianParameters, joints: tuple[str, ...]) -> Interfaces:
@@ -247,6 +266,8 @@ class CartesianController(Controller[CartesianParameters]):
     def _forget(self) -> None:
         self._phase = _Phase.RESTING
         self._goal: Goal | None = None
+        self._is_trial = False
+        """True while a motion is planned to be published, and not to be made."""
         self._waiting: PoseGoal | None = None
         self._ending: Outcome | None = None
         """Outcome of the goal once the tip rests; None: another goal begins then."""
@@ -289,7 +310,7 @@ class CartesianController(Controller[CartesianParameters]):
     def on_goal(self, goal: Goal, data: NDArray[np.float64], time_ns: int) -> None:
         """Plan a motion to the pose; a motion that is under way brakes first."""
         self._goal, self._start_ns, self._feedback_ns = goal, time_ns, time_ns + FEEDBACK_NS
-        self._ending = None
+        self._ending, self._is_trial = None, False
         if not self._at:
             self._hold_joints()
         if not self._at:
@@ -304,9 +325,13 @@ class CartesianController(Controller[CartesianParameters]):
             self._plan()
 
     def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
-        """Follow a twist; a pose that is under way ends as preempted."""
+        """Follow a twist; a pose that is under way ends as preempted. Or plan without moving."""
         if not self._at:
             self._hold_joints()
+        if kind == "plan":
+            self._try_plan(read_pose(data))
+            return
+        self._is_trial = False
         linear, angular, frame = read_twist(data)
         self._turns_with_tip = frame == self._chain.tip
         rotation: Rotation = IDENTITY
@@ -327,6 +352,21 @@ class CartesianController(Controller[CartesianParameters]):
         elif self._phase is not _Phase.STOPPING:
             self._phase = _Phase.STREAMING
 
+    def _try_plan(self, asked: PoseGoal) -> None:
+        """Plan a motion from rest to a pose, and publish it."""
+        if self._phase is _Phase.RESTING or self._is_trial:
+            self._is_trial, self._waiting = True, asked
+            self._plan()
+        else:
+            self._publish("the arm moves; ask again when it rests")
+
+    def _publish(self, text: str, path: Path | None = None) -> None:
+        self._is_trial = False
+        x, y, z = self._target[1]
+        last = [math.nan] * len(self.context.joints) if path is None else path.last
+        duration = math.nan if path is None else path.duration_s
+        self.context.publish("plan", PosePlan(x, y, z, np.array(last), duration, text))
+
     def on_hold(self, time_ns: int) -> None:
         """Brake from the twist: the stream has ended."""
         self._twist = _ZERO, _ZERO
@@ -345,6 +385,8 @@ class CartesianController(Controller[CartesianParameters]):
         goal, self._goal = self._goal, None
         if goal is not None:
             goal.end(outcome, text, joint)
+        elif self._is_trial:
+            self._publish(text)
 
     def _plan(self) -> None:
         """Begin to plan a motion from rest to the waiting goal."""
@@ -411,8 +453,8 @@ class CartesianController(Controller[CartesianParameters]):
         self._forget()
 
     def _advance_plan(self) -> None:
-        planning, goal, asked = self._planning, self._goal, self._asked
-        if planning is None or goal is None or asked is None:
+        planning, asked = self._planning, self._asked
+        if planning is None or asked is None:
             self._phase = _Phase.RESTING
             return
         for _ in range(self._steps):
@@ -434,6 +476,9 @@ class CartesianController(Controller[CartesianParameters]):
                 Outcome.ABORTED,
                 f"the motion takes {needed:.2f} s within its limits; ask for at least this time",
             )
+            return
+        if self._is_trial:
+            self._publish(_remark(found, asked), found)
             return
         self._stretch = 1.0
         if found.duration_s > 0 and not math.isnan(asked.seconds):
@@ -466,12 +511,7 @@ class CartesianController(Controller[CartesianParameters]):
         goal, self._goal = self._goal, None
         if goal is None:
             return
-        text, left = "", path.residual
-        if self._asked is not None and self._asked.asks_orientation and not left.is_close:
-            text = (
-                f"{math.degrees(left.orientation):.1f} deg from the orientation, which the arm cannot reach"
-            )
-        goal.judge(np.array(path.last), text=text)
+        goal.judge(np.array(path.last), text="" if self._asked is None else _remark(path, self._asked))
 
     def _brake(self) -> None:
         """Slow down on the path, as fast as the joints may brake, or from the twist."""
@@ -550,6 +590,14 @@ class CartesianController(Controller[CartesianParameters]):
             now + min(max(goal - now, -most * period_s), most * period_s)
             for goal, now, most in zip(found.positions, self._at, self._limits.velocity, strict=True)
         )
+
+
+def _remark(path: Path, asked: PoseGoal) -> str:
+    """Return what is not reached at the end of a path; empty if all is."""
+    if not asked.asks_orientation or path.residual.is_close:
+        return ""
+    off = math.degrees(path.residual.orientation)
+    return f"{off:.1f} deg from the orientation, which the arm cannot reach"
 
 
 def _frames(urdf: Urdf, context: Context) -> FrameTree:

@@ -45,11 +45,19 @@ def written(ledger: Path) -> set[tuple[int, int, bytes]]:
 
 
 class Run:
-    """A torso in a process of its own."""
+    """A robot in a process of its own, by default the torso."""
 
-    def __init__(self, place: Path, *words: str, record: bool = False) -> None:
+    def __init__(
+        self,
+        place: Path,
+        *words: str,
+        record: bool = False,
+        robot: str = "bioloid_torso_imu",
+        rate: int = 5,
+    ) -> None:
         """`words`: more words of its command line."""
         self.place, self.record, self.words = place, record, words
+        self.robot, self.rate = robot, rate
         self.ledger = place / "ledger.jsonl"
         self.process: subprocess.Popen[bytes] | None = None
         copy_robots(place)
@@ -57,8 +65,8 @@ class Run:
     def start(self) -> None:
         code = "from dxlrun.cli import main; main()"
         words = [
-            "robots/bioloid_torso_imu.yaml",
-            "rate:=5",
+            f"robots/{self.robot}.yaml",
+            f"rate:={self.rate}",
             *(() if self.record else ("--no-record",)),
             "--ledger",
             str(self.ledger),

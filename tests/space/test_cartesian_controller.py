@@ -167,6 +167,31 @@ def test_malformed_poses_are_refused(command: dict[str, Any], text: str) -> None
         CartesianController.Commands["pose"].model_validate(command)
 
 
+def test_a_plan_is_published_and_moves_nothing() -> None:
+    stage, arm = staged(), all_arms()["open_manipulator_x"]
+    for pose, text in (
+        ({"dz": 0.05}, ""),
+        ({"x": 0.9}, "the pose is out of reach"),
+        ({"dx": 0, "frame": "no"}, "frame no"),
+    ):
+        stage.give("plan", **pose)
+        rows = played(stage, 9.0)
+        assert rows == pytest.approx(np.tile(READY, (len(rows), 1)))
+        _, plan = stage.messages[-1]
+        assert plan.text.startswith(text)
+        assert np.isnan(plan.positions).all() == math.isnan(plan.duration) == bool(text)
+    assert len(stage.messages) == 3
+    _, plan = stage.messages[0]
+    assert arm.matrix(plan.positions)[:3, 3] == pytest.approx([plan.x, plan.y, plan.z], abs=1e-4)
+    assert plan.z == pytest.approx(arm.matrix(READY)[2, 3] + 0.05)
+    stage.send(None, "pose", dz=0.05)
+    played(stage, 0.6)
+    stage.give("plan", dz=-0.05)
+    assert stage.messages[-1][1].text == "the arm moves; ask again when it rests"
+    played(stage, 3.0)
+    assert stage.goal.ended[0][0] == "reached"
+
+
 def test_a_cancel_brakes_on_the_line() -> None:
     stage, begin = staged(), all_arms()["open_manipulator_x"].matrix(READY)
     stage.send(0.0, "pose", dz=0.1)

@@ -6,10 +6,12 @@ import ssl
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from importlib.resources import files
 from pathlib import Path
 
 import pytest
 from tests.kit.awaited import DEADLINE_S
+from tests.kit.browser import CHROMIUM, Browser
 from tests.kit.torso import Run
 from tests.view.served import Served
 
@@ -60,6 +62,18 @@ def live(run: Run) -> Iterator[LiveRobot]:
     robot = LiveRobot("bioloid_torso_imu")
     yield robot
     robot.close()
+
+
+@pytest.fixture(scope="package")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    if CHROMIUM is None:
+        pytest.skip("no Chromium is installed; apt install chromium")
+    if not files("dxlrun_view").joinpath("page", "build", "page.js").is_file():
+        pytest.skip("the page has no bundle; pip install plugins/dxlrun_view")
+    place = tmp_path_factory.mktemp("browser")
+    one = Browser(place, "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+    yield one
+    one.close()
 
 
 @pytest.fixture

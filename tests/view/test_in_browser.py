@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
-from importlib.resources import files
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from tests.kit.awaited import until
-from tests.kit.browser import CHROMIUM, Browser
+from tests.kit.browser import Browser
 from tests.kit.torso import GOAL_POSITION, JOINT, SERVO, TORQUE_ENABLE, Run
 from tests.view.served import Served
 
@@ -25,22 +24,6 @@ VISIBLE = "(selector => document.querySelector(selector).offsetParent !== null)"
 ENABLED = """[...document.querySelectorAll('fieldset :is(input, button, select)')]
   .filter(one => !one.matches(':disabled'))"""
 """In the page: the controls that steer the robot and can be used."""
-BUNDLE = files("dxlrun_view").joinpath("page", "build", "page.js")
-pytestmark = [
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed; apt install chromium"),
-    pytest.mark.skipif(
-        not BUNDLE.is_file(), reason="the page has no bundle; pip install plugins/dxlrun_view"
-    ),
-]
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    one = Browser(
-        tmp_path_factory.mktemp("browser"), "--use-angle=swiftshader", "--enable-unsafe-swiftshader"
-    )
-    yield one
-    one.close()
 
 
 def errors(browser: Browser) -> list[object]:

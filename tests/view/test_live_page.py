@@ -31,6 +31,8 @@ ACTIONS: tuple[dict[str, object], ...] = (
     {"verb": "torque", "joints": [JOINT], "on": True},
     {"verb": "switch", "controller": "left_arm", "on": True},
     {"verb": "goal", "joint": JOINT, "position": 0.2},
+    {"verb": "plan", "controller": "left_arm", "position": [0.1, 0.0, 0.1]},
+    {"verb": "pose", "controller": "left_arm", "position": [0.1, 0.0, 0.1]},
     {"verb": "play", "motion": "three_parts.yaml"},
     {"verb": "set_parameter", "controller": "left_arm", "parameter": "p", "value": 0.2},
 )
@@ -55,6 +57,8 @@ WRONG: tuple[object, ...] = (
     {"verb": "torque", "joints": ["no\nbody/../x"], "on": False},
     {"verb": "switch", "controller": "", "on": True},
     {"verb": "switch", "controller": "left_arm"},
+    {"verb": "plan", "controller": "left_arm", "position": [0.1, 0.0]},
+    {"verb": "pose", "controller": "left_arm"},
     {"verb": "play", "motion": None},
     {"verb": "play", "motion": "/etc/passwd"},
     {"verb": "parameters", "controller": "../../robot"},

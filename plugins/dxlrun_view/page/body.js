@@ -1,7 +1,8 @@
 // 3-D view of the robot: its URDF, rotated by the IMU, and a ghost at the goal positions.
 import { AmbientLight, Box3, Color, DirectionalLight, GridHelper, Group, HemisphereLight, Matrix4, Mesh,
-  MeshStandardMaterial, PerspectiveCamera, Quaternion, Scene, Vector3, WebGLRenderer } from "three";
+  MeshStandardMaterial, Object3D, PerspectiveCamera, Quaternion, Scene, Vector3, WebGLRenderer } from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
+import { TransformControls } from "three/examples/jsm/controls/TransformControls.js";
 import { ColladaLoader } from "three/examples/jsm/loaders/ColladaLoader.js";
 import { STLLoader } from "three/examples/jsm/loaders/STLLoader.js";
 import URDFLoader from "urdf-loader";
@@ -25,6 +26,13 @@ export class Body {
     this.controls = new OrbitControls(this.camera, canvas);
     this.controls.addEventListener("change", () => { this.dirty = true; });
     this.controls.addEventListener("start", () => { this.touched = true; });
+    this.grip = new Object3D();
+    this.drag = new TransformControls(this.camera, canvas);
+    this.drag.setSize(0.8);
+    this.drag.addEventListener("change", () => { this.dirty = true; });
+    this.drag.addEventListener("dragging-changed", ({ value }) => { this.controls.enabled = !value; });
+    this.drag.addEventListener("objectChange", () => this.dragged());
+    this.scene.add(this.drag.getHelper());
     this.dirty = true;
     new ResizeObserver(() => this.resize()).observe(canvas.parentElement);
     this.colour();
@@ -60,6 +68,7 @@ export class Body {
 
   // Show a URDF. `link` is the link of the IMU, or an empty text.
   load(urdf, link) {
+    this.grab(null);
     this.world.clear();
     this.robot = this.parse(urdf, false);
     this.ghost = this.parse(urdf, true);
@@ -104,6 +113,31 @@ export class Body {
     const scale = 10 ** Math.round(Math.log10(size * 1.5));
     this.grid.scale.setScalar(scale);
     this.dirty = true;
+  }
+
+  // Show a handle at a tip, {tip, base} by link, or none for null.
+  grab(handle) {
+    this.drag.detach();
+    this.grip.removeFromParent();
+    this.handle = handle;
+    if (handle) {
+      (this.robot.links[handle.base] ?? this.robot).add(this.grip);
+      this.drag.attach(this.grip);
+      this.moveGripToTip();
+    }
+    this.dirty = true;
+  }
+
+  moveGripToTip() {
+    this.robot.updateMatrixWorld(true);
+    const { matrixWorld } = this.robot.links[this.handle.tip];
+    this.grip.parent.matrixWorld.clone().invert().multiply(matrixWorld).decompose(this.grip.position, this.grip.quaternion, this.grip.scale);
+  }
+
+  // Return the place of the handle on the canvas, px.
+  placeOfGrip() {
+    const { x, y } = this.grip.getWorldPosition(new Vector3()).project(this.camera);
+    return [(x + 1) / 2 * this.canvas.clientWidth, (1 - y) / 2 * this.canvas.clientHeight];
   }
 
   // Move the robot and its ghost. `positions` and `goals` are by joint, rad or m. `orientation` is the

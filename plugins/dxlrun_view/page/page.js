@@ -5,6 +5,7 @@ import { Charts } from "./charts.js";
 import { drawControllers } from "./controllers.js";
 import { $, isNew, make } from "./dom.js";
 import { drawEvents, drawTimeline } from "./events.js";
+import { drawHandle, trial } from "./handle.js";
 import { drawHeader } from "./header.js";
 import { drawJoints } from "./joints.js";
 import { act, ask, say, stop } from "./requests.js";
@@ -65,8 +66,10 @@ function drawBody() {
     positions[name] = value(`${name}/position`);
     goals[name] = value(`${name}/goal_position`) ?? positions[name];
   }
+  drawHandle(body);
+  Object.assign(goals, trial());
   const turn = ["x", "y", "z", "w"].map((axis) => value(`${shown.imu}/orientation.${axis}`));
-  body.showGhost = $("ghost").checked;
+  body.showGhost = $("ghost").checked || Boolean(trial());
   body.pose(positions, goals, turn.includes(null) ? null : turn);
 }
 

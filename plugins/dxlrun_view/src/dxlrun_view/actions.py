@@ -6,17 +6,22 @@ text for the page's message line; all raise DxlrunError if the robot refuses.
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar
+import math
+import time
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar
 
 import msgspec
 
 from dxlrun import DxlrunError, InputError, RemoteRobot
 from dxlrun.tooling.live import Parameter
 from dxlrun_view.live_robot import LiveRobot, info_of
-from dxlrun_view.shown import ViewSource
+from dxlrun_view.shown import ViewedController, ViewSource
 
 LEAD_S = 0.3
 """Time in which a trajectory controller moves a joint to the position of its slider, s"""
+PLAN_S, POLL_S = 2.0, 0.02
+"""Longest time that a controller has to plan a motion, s, and time between two requests for the plan, s"""
 Names = Annotated[tuple[str, ...], msgspec.Meta(min_length=1)]
 
 
@@ -27,6 +32,8 @@ class ActionResult(msgspec.Struct, frozen=True):
     """Text for the message line of the page"""
     parameters: tuple[Parameter, ...] = ()
     """Answer to ListParameters; empty for all other actions"""
+    goal: Mapping[str, float] = {}
+    """Answer to PlanAction: joint positions at the end, rad or m; empty without a motion"""
 
 
 class _Message(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="verb"):
@@ -119,6 +126,61 @@ class GoalAction(_Message, frozen=True, tag="goal"):
         raise InputError(f"no active controller commands the position of {self.joint}; activate one")
 
 
+class _PoseMessage(_Message, frozen=True):
+    """Pose of a handle: position in the base, m, and orientation (x, y, z, w) if it was turned."""
+
+    controller: str
+    position: tuple[float, float, float]
+    quaternion: tuple[float, float, float, float] | None = None
+
+    def command(self) -> dict[str, object]:
+        """Return the fields of the command."""
+        return dict(zip("xyz", self.position, strict=True)) | {"quaternion": self.quaternion}
+
+
+class PlanAction(_PoseMessage, frozen=True, tag="plan"):
+    """Handle that is dragged: plan the motion of its tip there, without moving it."""
+
+    def perform_on(self, robot: RemoteRobot) -> ActionResult:
+        """Return the joints' positions at the end of the motion, or the reason why there is none.
+
+        Raises:
+            DxlrunError: The controller has a goal, refuses the pose, or does not answer.
+        """
+        name, topic = self.controller, f"/{self.controller}/plan"
+        if any(goal.controller == name and goal.status == "running" for goal in robot.goals()):
+            raise InputError(f"{name} moves; wait for the end of its goal")
+        before = robot.newest(topic)
+        robot.send(name, "plan", self.command())
+        until_s = time.monotonic() + PLAN_S
+        while time.monotonic() < until_s:
+            found = robot.newest(topic)
+            if found is not None and (before is None or found.number > before.number):
+                plan = found.message
+                if [plan["x"], plan["y"], plan["z"]] == [*self.position]:
+                    return _planned(plan, next(row for row in info_of(robot).controllers if row.name == name))
+            time.sleep(POLL_S)
+        raise InputError(f"{name} has not planned within {PLAN_S:g} s; drag again")
+
+
+def _planned(plan: Mapping[str, Any], row: ViewedController) -> ActionResult:
+    """Return the answer to PlanAction, from the message of a plan."""
+    if math.isnan(plan["duration"]):
+        return ActionResult(plan["text"])
+    positions = dict(zip(row.joints, map(float, plan["positions"]), strict=True))
+    remark = f", {plan['text']}" if plan["text"] else ""
+    return ActionResult(f"{plan['duration']:.1f} s{remark}", goal=positions)
+
+
+class PoseAction(_PoseMessage, frozen=True, tag="pose"):
+    """Send button of a handle: move its tip there."""
+
+    def perform_on(self, robot: RemoteRobot) -> ActionResult:
+        """Start the motion, without waiting for its end."""
+        goal = robot.send(self.controller, "pose", self.command()).goal
+        return ActionResult(f"{self.controller} moves" + (f" (goal {goal.number})" if goal else ""))
+
+
 class PlayAction(_Message, frozen=True, tag="play"):
     """Play a motion file from the directory `motions` next to the robot file, or a motion of a controller."""
 
@@ -164,6 +226,8 @@ Action = (
     | TorqueAction
     | SwitchAction
     | GoalAction
+    | PlanAction
+    | PoseAction
     | PlayAction
     | ParameterListAction
     | ParameterAction

@@ -18,7 +18,7 @@ from dxlrun.tooling.records import Torque
 from dxlrun.tooling.robots import read_motion
 from dxlrun.tooling.topics import LogTopic
 from dxlrun_view.curves import JOINT_COLUMNS, Curve, History, Moment, Values, columns_of, numbers_in
-from dxlrun_view.shown import LiveEvent, SourceProperties, ViewedRobot
+from dxlrun_view.shown import LiveEvent, SourceProperties, ViewedHandle, ViewedRobot
 from dxlwire import Mode
 
 PERIOD_S = 0.04
@@ -53,6 +53,7 @@ class LiveRobot:
         self._info = ViewedRobot(name)
         self._urdf, self._imu, self._imu_link = "", "", ""
         self._motions: tuple[str, ...] = ()
+        self._handles: tuple[ViewedHandle, ...] = ()
         self._units: Mapping[str, str] = {}
         self._history = History((), 1)
         self._cycle = -1
@@ -88,6 +89,7 @@ class LiveRobot:
             units=self._units,
             fields=tuple(name for names in self._fields.values() for name in names),
             motions=self._motions,
+            handles=self._handles,
             imu=self._imu,
             imu_link=self._imu_link,
         )
@@ -168,6 +170,7 @@ class LiveRobot:
         tree = robot.frames() if self._urdf else None
         self._imu, self._imu_link = (tree.imu, tree.imu_link) if tree is not None else ("", "")
         self._motions = tuple(offered_motions(self._info))
+        self._handles = tuple(_handles(robot)) if self._urdf else ()
         self._fields = {}
         self._last_event, self._known_until_s = 0, self._events[-1].time if self._events else -1.0
         self._cycle = -1
@@ -277,6 +280,21 @@ def offered_motions(info: ViewedRobot) -> Iterator[str]:
                 yield str(path)
     for row in info.controllers:
         yield from (f"{row.name}/{motion}" for motion in row.motions)
+
+
+class _Commanded(msgspec.Struct, frozen=True):
+    """Controller with the kinds of its commands, as a row of RobotInfo."""
+
+    name: str
+    takes: Mapping[str, object]
+
+
+def _handles(robot: RemoteRobot) -> Iterator[ViewedHandle]:
+    """Yield the tip of each controller that plans and moves one."""
+    for row in msgspec.convert(robot.info()["controllers"], list[_Commanded]):
+        if {"plan", "pose"} <= row.takes.keys():
+            given = robot.parameters(row.name)
+            yield ViewedHandle(row.name, str(given["tip"]), str(given["base"]))
 
 
 def _of_joints(states: RobotStates) -> Iterator[Values]:

@@ -64,6 +64,17 @@ class ViewedRobot(msgspec.Struct, frozen=True):
     """First servo of each joint"""
 
 
+class ViewedHandle(msgspec.Struct, frozen=True):
+    """Tip of an arm that can be dragged on the page"""
+
+    controller: str
+    """Controller that plans and moves the tip: it takes `plan` and `pose`"""
+    tip: str
+    """Link of the URDF"""
+    base: str
+    """Link in whose axes its poses are; empty: the root"""
+
+
 class LiveEvent(msgspec.Struct, frozen=True):
     """Event of the run, a line of the page's list: error, warning or information"""
 
@@ -122,6 +133,8 @@ class SourceProperties(msgspec.Struct, frozen=True, kw_only=True):
     """True if the page may steer the robot"""
     motions: tuple[str, ...] = ()
     """Paths of the motion files that the page may play"""
+    handles: tuple[ViewedHandle, ...] = ()
+    """Tips that the page may drag"""
     imu: str = ""
     """Sensor whose orientation turns the robot's body in the 3-D view; empty without one"""
     imu_link: str = ""
