@@ -149,11 +149,11 @@ class PosePlan:
     """Message of the topic `plan`: the motion that the command `plan` asked for, and that is not made."""
 
     x: float
-    """Position of the tip in the base at its end, m."""
+    """Goal position of the tip in the base, m."""
     y: float
     z: float
     positions: Floats
-    """Positions of the joints at its end, rad; NaN without a motion."""
+    """Goal positions of the joints, rad; NaN without a motion."""
     duration: float
     """Shortest duration, s; NaN without a motion."""
     text: str

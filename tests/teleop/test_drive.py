@@ -142,6 +142,7 @@ def test_tip_in_space_keeps_its_limits_and_those_of_the_joints() -> None:
     speeds = np.abs(np.diff(rows, axis=0)) / 0.05
     tips = np.array([arm.matrix(row)[:3, 3] for row in rows])
     tip_speeds = np.linalg.norm(np.diff(tips, axis=0), axis=1) / 0.05
+    assert np.sign(tips[-1] - tips[0]).tolist() == [-1, 1, -1]  # backward, left, down
     assert speeds.max() < 4.8
     assert 0.15 < tip_speeds.max() < 0.2 * 1.05
     assert tip_speeds[times[1:] > END_S + 0.15 + 0.4 + 0.1].max() == 0.0  # lease, and 0.2 m/s at 0.5 m/s^2
