@@ -23,10 +23,11 @@ BROADCAST = 254
 
 
 def copy_robots(place: Path) -> None:
-    """Copy the folder of robot files; of the torso a reply may be late, as on a busy machine."""
+    """Copy the folder of robot files; of two a reply may be late, as on a busy machine."""
     shutil.copytree(ROBOTS, place / "robots")
-    torso = place / "robots/bioloid_torso.yaml"
-    torso.write_text(torso.read_text().replace("latency: 1 ms", "latency: 20 ms"))
+    for name in ("bioloid_torso", "open_manipulator_x"):
+        robot = place / f"robots/{name}.yaml"
+        robot.write_text(robot.read_text().replace("latency: 1 ms", "latency: 20 ms"))
 
 
 def settled(ledger: Path, cycles: Callable[[], int], quiet: int) -> set[tuple[int, int, bytes]]:

@@ -28,7 +28,7 @@ TICK = math.tau / 4096
 
 @pytest.fixture(scope="module")
 def arm(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
-    one = Run(tmp_path_factory.mktemp("arm"), robot=NAME, rate=50)
+    one = Run(tmp_path_factory.mktemp("arm"), robot=NAME, rate=10)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_RUNTIME_DIR", str(one.place))
         one.start()
@@ -84,7 +84,7 @@ def test_a_pose_is_planned_without_a_motion_and_then_sent(arm: Run, page: Callab
     assert sent(arm) == begin, "a plan moved a joint"
     assert acted(served, "pose", goal)[0] == 200
     assert "moves" in acted(served, "plan", goal)[1]["refused"]
-    until(lambda: acted(served, "plan", goal)[0] == 200)  # the goal has ended
+    until(lambda: acted(served, "plan", goal)[0] == 200, lambda: acted(served, "plan", goal))  # at its end
     until(lambda: np.abs(tip(arm) - goal).max() < 1e-3)
     assert [acted(page(control=False), verb, goal)[0] for verb in ("plan", "pose")] == [403, 403]
 

@@ -20,7 +20,7 @@ from dxlrun_view.shown import ViewedController, ViewSource
 
 LEAD_S = 0.3
 """Time in which a trajectory controller moves a joint to the position of its slider, s"""
-PLAN_S, POLL_S = 2.0, 0.02
+PLAN_S, POLL_S = 10.0, 0.02
 """Longest time that a controller has to plan a motion, s, and time between two requests for the plan, s"""
 Names = Annotated[tuple[str, ...], msgspec.Meta(min_length=1)]
 

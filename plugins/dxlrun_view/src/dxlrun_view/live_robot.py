@@ -294,6 +294,8 @@ def _handles(robot: RemoteRobot) -> Iterator[ViewedHandle]:
     for row in msgspec.convert(robot.info()["controllers"], list[_Commanded]):
         if {"plan", "pose"} <= row.takes.keys():
             given = robot.parameters(row.name)
+            if "leader.tip" in given:
+                continue  # the tip follows another one
             yield ViewedHandle(row.name, str(given["tip"]), str(given["base"]))
 
 
