@@ -34,6 +34,8 @@ class Tracks:
         self.desired = SplineSample(joints)
         self.still = np.ones(joints, dtype=np.bool_)
         """True for each joint at rest: it follows neither a trajectory nor a stop."""
+        self.all_still = True
+        """True while all joints are at rest."""
         self.stop = StopTrajectory(joints)
         self._stopping = np.zeros(joints, dtype=np.bool_)
         self._own = SplineSample(joints)
@@ -44,11 +46,6 @@ class Tracks:
     def playing(self) -> bool:
         """True while a joint follows a trajectory; a stop does not count."""
         return bool(self._playing)
-
-    @property
-    def all_still(self) -> bool:
-        """True while all joints are at rest."""
-        return b"\0" not in self.still.tobytes()
 
     def free(self) -> Track:
         """Return a track that no joint follows, for the next trajectory."""
@@ -70,12 +67,14 @@ class Tracks:
         track.ahead_s = 0.0
         self._stopping &= ~moved
         self.still &= ~moved
+        self.all_still = bool(self.still.all())
 
     def end_tracks(self) -> None:
         """End all tracks and the stop at once: all joints count as at rest."""
         self._playing = ()
         self._stopping.fill(False)
         self.still.fill(True)
+        self.all_still = True
 
     def come_to_rest(self, limits: SplineLimits) -> None:
         """End all tracks, and decelerate all joints to rest from the desired state."""
@@ -83,6 +82,7 @@ class Tracks:
         self.stop.load(self.desired, limits.deceleration, limits.lower, limits.upper)
         self._stopping.fill(True)
         self.still.fill(False)
+        self.all_still = False
 
     def sample(self, clock_s: float, rate: float, slope: float, stop_s: float) -> None:
         """Compute the desired state of this cycle, and remove tracks that have ended.
@@ -108,10 +108,12 @@ class Tracks:
             np.copyto(desired.rows, own.rows, where=self._stopping)
             if stop_s >= self.stop.duration_s:
                 self.still |= self._stopping
+                self.all_still = bool(self.still.all())
                 self._stopping.fill(False)
 
     def _leave_ended(self, clock_s: float) -> None:
         for track in self._playing:
             if clock_s + track.ahead_s >= track.trajectory.duration_s:
                 self.still |= track.joints
+                self.all_still = bool(self.still.all())
                 self._playing = tuple(other for other in self._playing if other is not track)
