@@ -178,8 +178,10 @@ def _played(totals: RunTotals) -> str:
     if files:
         return f"played {listed(files)} ({counted(motions, 'motion', 'motions')}){within}"
     sent = [act for act in totals.acts if act.origin != "loop" and not act.refusal and act.what]
-    if totals.conduct.goals.counts or any(act.set_points for act in sent):
+    if any(act.set_points for act in sent) or (totals.conduct.goals.counts and sent):
         return f"moved by clients{within}"
+    if totals.conduct.goals.counts:
+        return f"moved by its controllers{within}"
     ran = "the log has" if totals.damage else "ran for"
     return f"{ran} {totals.periods.seconds:.1f} s without a motion" if totals.periods.records else ""
 

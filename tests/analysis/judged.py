@@ -167,7 +167,7 @@ GIVEN: dict[str, Given] = {
     r"tracked (\w+), worst ([\d.]+) m": lambda run, name, worst: replace(
         run, tracking=(tracked(name, float(worst), unit=LINEAR),)
     ),
-    r"moved by clients, 1 of 1 cancelled": lambda run: replace(
+    r"moved by its controllers, 1 of 1 cancelled": lambda run: replace(
         _conduct(_played(run, "", "", "", ""), goals=GoalTotals({"accepted": 1, "cancelled": 1})),
         plan=LoggedPlan(),
     ),

@@ -269,13 +269,19 @@ def test_page_and_json_and_run_have_the_same_verdict(storm: Path, tmp_path: Path
 # Falls
 
 
+def test_motion_that_a_controller_begins_is_not_one_of_clients(tmp_path: Path) -> None:
+    log = tmp_path / "run.mcap"
+    simulated_robot(ROBOTS / "fall_reflex.yaml", duration_s=1.0, log=log).run()
+    assert "; moved by its controllers within" in judge_run(totals_of(log)).sentences[0]
+
+
 def test_robot_that_its_fall_reflex_could_not_keep_up_fell(tmp_path: Path) -> None:
     motion, log = ROBOTS / "motions/fall_reflex_tip.yaml", tmp_path / "run.mcap"
     simulated_robot(ROBOTS / "fall_reflex.yaml", play=[motion], log=log).run()
     verdict = judge_run(totals_of(log))
     assert not verdict.good
     assert verdict.sentences[0].startswith(
-        "Not good: the robot fell at 1.6 s and did not get up; played fall_reflex_tip "
+        "Not good: the robot fell at 1.6 s and did not get up; play of wave aborted; played fall_reflex_tip "
     )
     assert verdict.findings[1].code == "fell"
 
