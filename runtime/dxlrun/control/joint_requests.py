@@ -16,6 +16,7 @@ from dxlrun.channels.cycle import LIMP, OFFLINE, Torque
 from dxlrun.channels.loop_requests import RebootRequest, Register, RegisterReading, TorqueRequest
 from dxlrun.control import texts
 from dxlrun.control.context import ControlContext
+from dxlrun.control.controllers.changed_registers import ChangedRegisters
 from dxlrun.control.controllers.switching import Switching
 
 
@@ -38,17 +39,23 @@ class JointRequests:
     Args:
         context: The run.
         switching: Deactivates controllers that command the joints.
+        registers: Registers that controllers change.
         answer: Sends the answer to a command, by the command's number.
     """
 
     def __init__(
-        self, context: ControlContext, switching: Switching, answer: Callable[[int, Answer], None]
+        self,
+        context: ControlContext,
+        switching: Switching,
+        registers: ChangedRegisters,
+        answer: Callable[[int, Answer], None],
     ) -> None:
         self._joints = context.plan.joints
         self._rows = {joint.name: row for row, joint in enumerate(self._joints)}
         self._hardware = context.hardware
         self._record = context.record
         self._switching = switching
+        self._registers = registers
         self._answer = answer
         self._pending: dict[int, _PendingRequest] = {}
 
@@ -78,7 +85,7 @@ class JointRequests:
                 return rows
             row = rows[request.joint]
         if isinstance(request, Register):
-            done = partial(self._answer_register, number, Code.REGISTER_NOT_WRITTEN)
+            done = partial(self._finish_write, number, row, request)
             self._hardware.write_register(row, request.item, request.value, done)
         else:
             done = partial(self._answer_register, number, Code.REGISTER_NOT_READ)
@@ -213,6 +220,13 @@ class JointRequests:
             problems = "; ".join(dict.fromkeys(pending.problems))
             answer = Refusal(pending.code, {"joint": tuple(pending.joints), "problem": problems})
         self._answer(number, answer)
+
+    def _finish_write(
+        self, number: int, row: int, request: Register, problem: str, found: int | None
+    ) -> None:
+        if not problem:
+            self._registers.keep_value(row, request.item, request.value)
+        self._answer_register(number, Code.REGISTER_NOT_WRITTEN, problem, found)
 
     def _answer_register(self, number: int, code: Code, problem: str, found: int | None) -> None:
         """Answer a register request with the value read, None after a write, or with the problem."""

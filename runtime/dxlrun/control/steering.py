@@ -102,7 +102,7 @@ class Steering:
         actions: PolicyActions,
     ) -> None:
         self.inbox = context.inbox
-        self.joints = JointRequests(context, manager.switching, self._answer)
+        self.joints = JointRequests(context, manager.switching, manager.registers, self._answer)
         self.halt = Halt(context, manager.switching, self._answer)
         self.anchoring = Anchoring(context, manager.switching, gate)
         self.paused_until_ns = 0

@@ -91,6 +91,22 @@ class ChangedRegisters:
             register.has_failed = False
             self._write(register)
 
+    def keep_value(self, row: int, item: str, value: int) -> None:
+        """Use a value that a client wrote as the one from before; a later change of a controller replaces it.
+
+        Args:
+            row: Row of the joint, or of one servo, in register requests.
+            item: Control table item.
+            value: Integer on the wire, which was read back.
+        """
+        for register in self._registers.values():
+            if (
+                item == register.item
+                and row in (register.row, register.joint)
+                and register.before is not None
+            ):
+                register.before = register.written = value
+
     @property
     def time_left_ns(self) -> int:
         """Time that the last values from before still need, ns; the same in a replay."""
