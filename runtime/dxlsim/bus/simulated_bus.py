@@ -388,6 +388,9 @@ class SimulatedBus:
             Task.PIECE: lambda *_: self._chance.randint(1, _LONGEST_PIECE),
             Task.LEDGER: lambda *_: self.ledger.take_entries(),
             Task.RATE: lambda rate, _: self.change_rate(rate),
+            Task.WRITTEN: lambda index, goals: self.servos[index].follow_written_goals(
+                goals, self._line.end_ns
+            ),
         }
         return [tasks[task] for task in Task]
 

@@ -22,6 +22,16 @@ ErrorOf = Callable[[Memory, ControlItem, int], int]
 """Returns the error with which a value of an item (signed if the item is) is rejected; 0: the value is
 accepted."""
 
+Bounds = tuple[int, int]  # Lowest and highest value
+ANYTHING, NOTHING = (-1 << 62, 1 << 62), (1, 0)
+
+RULES = (
+    *("operating_mode", "min_position_limit", "max_position_limit", "cw_angle_limit", "ccw_angle_limit"),
+    *("control_mode", "pwm_limit", "current_limit", "velocity_limit", "acceleration_limit", "torque_limit"),
+    "bus_watchdog",
+)
+"""Items that decide which goals a servo accepts."""
+
 _TURNS = 256
 """Range of extended position control in either direction, revolutions (e-Manual, X series, Goal Position
 (116): 1,048,575 ticks)."""
@@ -124,12 +134,25 @@ def lock_error(memory: Memory, item: ControlItem, value: int) -> int:
     if locked or strong:
         return ErrorBit.RANGE
     error = device_error(memory, item, value)
-    return error or (ErrorBit.ANGLE_LIMIT if _outside_angle_limits(memory, item, value) else 0)
+    lowest, highest = _angle_limits(memory, item)
+    return error or (0 if lowest <= value <= highest else ErrorBit.ANGLE_LIMIT)
 
 
 def torque_error(memory: Memory, item: ControlItem, value: int) -> int:
     """Return the error with which a servo of Protocol 2.0 rejects a value for its range or the servo's
     limits; 0: accepted."""
+    known = next(
+        (one.values for one in ACCESS.values.get(item.name, ()) if one.fit(item, memory.table)), None
+    )
+    lowest, highest = _range_of(memory, item)
+    if not (lowest <= value <= highest if known is None else value in known):
+        return StatusErrorNumber.DATA_RANGE
+    lowest, highest = _limits_of(memory, item)
+    return 0 if lowest <= value <= highest else StatusErrorNumber.DATA_LIMIT
+
+
+def _range_of(memory: Memory, item: ControlItem) -> Bounds:
+    """Return the values of an item that a servo of Protocol 2.0 has a meaning for, whatever its limits."""
     name, table = item.name, memory.table
     one_turn = name == "goal_position" and _one_turn(memory)
     lowest, highest = item.minimum, item.maximum
@@ -139,27 +162,38 @@ def torque_error(memory: Memory, item: ControlItem, value: int) -> int:
     elif name == "goal_position":
         highest = max(round(_TURNS * math.tau / table.rad_per_tick) - 1, highest)
         lowest = -highest
-    known = next((one.values for one in ACCESS.values.get(name, ()) if one.fit(item, table)), None)
-    taken = lowest <= value <= highest if known is None else value in known
-    if not taken or (name in ACCESS.goals and watchdog_expired(memory)):
-        return StatusErrorNumber.DATA_RANGE
+    return (lowest, highest) if not watchdog_expired(memory) or name not in ACCESS.goals else NOTHING
+
+
+def _limits_of(memory: Memory, item: ControlItem) -> Bounds:
+    """Return the values of an item within the limits that the registers of a servo of Protocol 2.0 set."""
+    name, table = item.name, memory.table
     limit_name = ACCESS.limits.get(name, "")
     if name in ACCESS.limits_of_p and table.items["torque_enable"].address == TORQUE_ENABLE_OF_P:
         limit_name = ACCESS.limits_of_p[name]
     if limit_name in memory:
-        beyond = abs(value) > memory[limit_name]
-    elif one_turn and "max_position_limit" in memory:
-        beyond = not memory.ticks("min_position_limit") <= value <= memory.ticks("max_position_limit")
-    else:
-        beyond = _outside_angle_limits(memory, item, value)
-    return StatusErrorNumber.DATA_LIMIT if beyond else 0
+        return -memory[limit_name], memory[limit_name]
+    if name == "goal_position" and "max_position_limit" in memory and _one_turn(memory):
+        return memory.ticks("min_position_limit"), memory.ticks("max_position_limit")
+    return _angle_limits(memory, item)
 
 
-def _outside_angle_limits(memory: Memory, item: ControlItem, value: int) -> bool:
+def _angle_limits(memory: Memory, item: ControlItem) -> Bounds:
     if item.name != "goal_position" or "cw_angle_limit" not in memory:
-        return False
+        return ANYTHING
     free = multi_turn_mode(memory) or wheel_mode(memory)
-    return not free and not memory["cw_angle_limit"] <= value <= memory["ccw_angle_limit"]
+    return ANYTHING if free else (memory["cw_angle_limit"], memory["ccw_angle_limit"])
+
+
+def accepted_goals(memory: Memory, item: ControlItem) -> Bounds:
+    """Return the values of a goal that a servo accepts now without an error, all or some of them."""
+    if memory.table.protocol == 2.0:
+        ranges = _range_of(memory, item), _limits_of(memory, item)
+    elif multi_turn_mode(memory) or item.name == "goal_torque":
+        return NOTHING  # Two's complement, or a limit of the magnitude: not a range of integers on the wire
+    else:
+        ranges = (item.minimum, item.maximum), _angle_limits(memory, item)
+    return max(lowest for lowest, _ in ranges), min(highest for _, highest in ranges)
 
 
 def _one_turn(memory: Memory) -> bool:

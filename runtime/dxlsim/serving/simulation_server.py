@@ -31,7 +31,7 @@ from dxlwire.exceptions import InputError
 
 IDLE_NS = 300_000  # Time reserved for a few steps of the mechanics
 
-_ADAPTER, _ASKED = 1, 2  # Bits of what Python has to do after `line_serve`
+_ADAPTER, _ASKED, _RAISED = 1, 2, 4  # Bits of what Python has to do after `line_serve`
 _BUDGET_NS = 20_000_000  # Time for which a server may poll at first, ns
 
 _GOAL_MODES = (3, 4, 5)
@@ -143,8 +143,9 @@ class Server:
         self._state.easy_ns = self._work_in_idle_time(now_ns) if idle else NEVER_NS
         self._wait(self._address)
         news = self._library.line_serve(self._address)
-        for bus in self._buses:
-            bus.raise_stored()
+        if news & _RAISED:
+            for bus in self._buses:
+                bus.raise_stored()
         if news & _ADAPTER:
             for terminal in self._terminals:
                 terminal.follow_adapter()

@@ -10,15 +10,17 @@ the firmware version beyond the control table, the fast reads, Clear and Control
 
 from __future__ import annotations
 
+import ctypes
 import math
 from abc import abstractmethod
 from collections.abc import Callable
 
 from dxlsim.motion.compiled_mechanics import function_address
 from dxlsim.motion.shaft import Shaft
-from dxlsim.registers.access import ErrorOf, lock_error
+from dxlsim.registers.access import ACCESS, RULES, ErrorOf, accepted_goals, lock_error
 from dxlsim.registers.memory import Memory
 from dxlsim.servo.node import BULK_READ, Answer, SimulatedNode
+from dxlsim.wire.compiled_line import GoalState
 from dxlsim.wire.servo_packets import Instruction, InstructionPacket
 from dxlsim.wire.servo_protocol1 import ErrorBit
 
@@ -51,6 +53,14 @@ class SimulatedServo(SimulatedNode):
         self.voltage = _supply(memory)
         shaft.mechanics.watch_servo(shaft.index, self._strained)
         self._watch_identity()
+        named = (memory.table.items.get(name) for name in sorted(ACCESS.goals | shaft.items.aims))
+        self._goals = [item for item in named if item is not None and item.access == "RW"]
+        self._accepted = (GoalState * max(len(self._goals), 1))(
+            *(GoalState(address=item.address, size=item.size, is_signed=item.signed) for item in self._goals)
+        )
+        self._names_of: dict[int, frozenset[str]] = {}
+        self.line.goals, self.line.goal_count = ctypes.addressof(self._accepted), len(self._goals)
+        memory.watch_items(RULES, self._accept_goals)
 
     def _identify(self) -> None:
         super()._identify()
@@ -82,6 +92,21 @@ class SimulatedServo(SimulatedNode):
         self.shaft.advance_to(now_ns)
         return super().execute_packet(packet, now_ns)
 
+    def _accept_goals(self) -> None:
+        """Let the line know the goals that the servo accepts now; Python executes other writes."""
+        for accepted, item in zip(self._accepted, self._goals, strict=False):
+            accepted.lowest, accepted.highest = accepted_goals(self.registers, item)
+
+    def follow_written_goals(self, goals: int, now_ns: int) -> None:
+        """Follow goals that the line has written, whose instruction ended at `now_ns`."""
+        names = self._names_of.get(goals)
+        if names is None:
+            written = (item.name for index, item in enumerate(self._goals) if goals >> index & 1)
+            names = self._names_of[goals] = frozenset(written)
+        self.shaft.advance_to(now_ns)
+        self._written(names)
+        self._pause_after_write()
+
     def excuse(self, duration_ns: int) -> None:
         """Do not count a stall of this process, of `duration_ns`, toward the timeout of the Bus Watchdog."""
         self.line.received_ns += duration_ns
@@ -108,10 +133,14 @@ class SimulatedServo(SimulatedNode):
 
     def _write(self, address: int, data: bytes) -> int:
         error = super()._write(address, data)
-        if self.write_time_ns and not error:
+        if not error:
+            self._pause_after_write()
+        return error
+
+    def _pause_after_write(self) -> None:
+        if self.write_time_ns:
             line = self.line
             self._receive_nothing_until(max(line.deaf_until_ns, line.received_ns + self.write_time_ns))
-        return error
 
     def _written(self, names: frozenset[str]) -> None:
         self.shaft.plan(names)

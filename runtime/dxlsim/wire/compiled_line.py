@@ -18,10 +18,22 @@ from dxlwire.compiled import load_compiled, parse_structs
 
 SOURCE = Path(__file__).with_name("line.c")
 STRUCTS = parse_structs(SOURCE.read_text())
-NodeState, LineState, LedgerState, Entry, Asked, Port, Ports, TerminalState, ServerState, PollBudget = (
+(
+    NodeState,
+    GoalState,
+    LineState,
+    LedgerState,
+    Entry,
+    Asked,
+    Port,
+    Ports,
+    TerminalState,
+    ServerState,
+    PollBudget,
+) = (
     STRUCTS[name]
     for name in (
-        *("Node", "Line", "Ledger", "Entry", "Asked"),
+        *("Node", "Goal", "Line", "Ledger", "Entry", "Asked"),
         *("Port", "Ports", "Terminal", "Server", "PollBudget"),
     )
 )
@@ -60,6 +72,7 @@ class Task(IntEnum):
     PIECE = 14  # Draw the size of the next piece of a delivery
     LEDGER = 15  # Take the entries of the ledger
     RATE = 16  # The host has set another baud rate
+    WRITTEN = 17  # A servo follows goals that were written, by their bits
 
 
 _FUNCTIONS: dict[str, tuple[type | None, tuple[object, ...]]] = {

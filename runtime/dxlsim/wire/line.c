@@ -43,11 +43,12 @@
 #define LATENESSES 1000
 #define NOTE_ROOM 16
 
-enum { PING = 0x01, READ = 0x02, SYNC_READ = 0x82, FAST_SYNC_READ = 0x8a, BULK_READ = 0x92, FAST_BULK_READ = 0x9a };
+enum { PING = 0x01, READ = 0x02, SYNC_READ = 0x82, SYNC_WRITE = 0x83, FAST_SYNC_READ = 0x8a, BULK_READ = 0x92,
+       FAST_BULK_READ = 0x9a };
 enum { INTO, OUT }; /* directions in the ledger, as seen from the servos */
 /* Tasks of Python, in the order of compiled_line.py */
 enum { STEP, RECEIVES, PRESENT, EXECUTE, EXECUTE_ALL, REFUSED, STAYS_OUT, CHAIN, OVERHEAR, NOTE, ACT, ACT_AFTER,
-       DISTURB, ALTER, PIECE, LEDGER, RATE };
+       DISTURB, ALTER, PIECE, LEDGER, RATE, WRITTEN };
 
 typedef struct { /* bytes that grow */
     uint8_t *data;
@@ -74,6 +75,11 @@ typedef struct { /* part of a node's registers that is about to be read */
     int32_t node, address, length;
 } Asked;
 
+typedef struct { /* goal of a servo, and the values that it accepts now */
+    int64_t lowest, highest;
+    int32_t address, size, is_signed, unused;
+} Goal;
+
 typedef struct { /* one servo or device, as the line sees it */
     uint8_t *memory;
     const uint8_t *owned;  /* for each byte: 1: it belongs to an item; 2: reads of it are refused */
@@ -85,7 +91,8 @@ typedef struct { /* one servo or device, as the line sees it */
     int32_t answers_damaged, level_at, error_at, error_size, error_bits;
     int32_t group_reads;   /* bits: sync, bulk, fast sync, fast bulk read */
     int32_t least_entries; /* shortest list of a group read that it answers */
-    int32_t unused;
+    int32_t goal_count;
+    const Goal *goals;
     void (*show)(void *shaft, int64_t now_ns, int32_t address, int32_t length); /* writes the motion into `memory`: */
     void *shaft;           /* motion_show of mechanics.c; NULL: Python sets registers before they are read */
 } Node;
@@ -1247,6 +1254,52 @@ static int replies_to(const Node *n, const Packet *p)
     return own && level(n) >= (p->instruction == READ ? 1 : 2);
 }
 
+/* Find the data of a node in a sync write. Return NULL if they are not there exactly once, with its own ID; `listed` is
+ * 0 if the list is right and has nothing for the node. */
+static const uint8_t *listed_data(int32_t protocol, const Packet *p, const Node *n, Entry *place, int32_t *listed)
+{
+    const uint8_t *d = p->parameters, *found = NULL;
+    int32_t start = protocol == 1 ? 2 : 4, size = p->size - start;
+    *listed = 1;
+    if (size <= 0)
+        return NULL;
+    *place = (Entry){n->id, protocol == 1 ? d[0] : word(d), protocol == 1 ? d[1] : word(d + 2)};
+    if (!place->length || size % (place->length + 1))
+        return NULL;
+    *listed = 0;
+    for (int32_t at = start; at < p->size; at += place->length + 1)
+        if (d[at] == n->id || d[at] == n->secondary_id) {
+            found = d[at] == n->id && !*listed ? d + at + 1 : NULL;
+            *listed += 1;
+        }
+    return found;
+}
+
+/* Write whole goals, all with values that the servo accepts. Return the bits of these goals; 0: nothing is written. */
+static int64_t write_goals(const Node *n, const Entry *place, const uint8_t *data)
+{
+    int64_t written = 0;
+    for (int32_t at = 0; at < place->length;) {
+        int32_t i = 0;
+        while (i < n->goal_count && n->goals[i].address != place->address + at)
+            i++;
+        if (i == n->goal_count || at + n->goals[i].size > place->length)
+            return 0;
+        const Goal *g = &n->goals[i];
+        int64_t value = 0;
+        for (int32_t byte = 0; byte < g->size; byte++)
+            value |= (int64_t)data[at + byte] << 8 * byte;
+        if (g->is_signed && value >> (8 * g->size - 1))
+            value -= (int64_t)1 << 8 * g->size;
+        if (value < g->lowest || value > g->highest)
+            return 0;
+        written |= (int64_t)1 << i;
+        at += g->size;
+    }
+    memcpy(n->memory + place->address, data, (size_t)place->length);
+    return written;
+}
+
 static void execute_for(Bus *b, int32_t index, const Packet *p, int64_t end_ns)
 {
     Node *n = b->line.nodes[index];
@@ -1254,6 +1307,15 @@ static void execute_for(Bus *b, int32_t index, const Packet *p, int64_t end_ns)
     n->received += p->intact;
     if (!receives(b, index, end_ns))
         return;
+    if (p->intact && p->instruction == SYNC_WRITE && p->id == BROADCAST) {
+        int32_t listed;
+        const uint8_t *data = listed_data(b->line.protocol, p, n, &place, &listed);
+        int64_t written = data ? write_goals(n, &place, data) : 0;
+        if (written)
+            b->line.call(WRITTEN, index, written);
+        if (written || !listed)
+            return;
+    }
     int32_t id = n->id; /* a write of ID is still answered with the old ID [i] */
     int64_t error, delay_ns = n->delay_ns, replies = replies_to(n, p);
     if (p->instruction == PING && p->id == BROADCAST && b->line.protocol == 2)
@@ -1559,14 +1621,14 @@ int32_t line_port_wait(Ports *p, int64_t deadline_ns, uint8_t *ready) { return p
 #define LONGEST_SLEEP_NS 10000000    /* while a host watches the progress, so that a longer pause shows as a stall */
 #define STALL_NS 20000000            /* pause between two readings of the clock from which it counts as a stall */
 #define LONGEST_POLL_NS 50000        /* before a reply is due: a sleep wakes some 30 us late on a stock kernel */
-#define POLL_SHARE 6                 /* polling is limited to one part in this many of the time of waiting */
+#define POLL_SHARE 20                /* polling is limited to one part in this many of the time of waiting */
 #define BUDGET_NS 20000000
 #define PAUSE_NS 100000              /* shortest sleep while polling is not allowed */
 #define MOST_TERMINALS 256
 #define OTHERS 4                     /* descriptors of Python that wake the server as well */
 
 enum { TAKEN, SERVED, GIVEN, DUE }; /* words of a line's progress, for the host: heartbeat.py */
-enum { ADAPTER = 1, ASKED_FOR = 2 }; /* what Python has to do */
+enum { ADAPTER = 1, ASKED_FOR = 2, RAISED = 4 }; /* what Python has to do */
 
 typedef struct { /* decides how long a server sleeps before an event, and when it polls the clock instead */
     int64_t budget_ns, asked_ns, woken_ns;
@@ -1603,7 +1665,7 @@ static int64_t clock_ns(void)
 
 /* Return the time to sleep before the next event, ns; 0: poll the clock; NEVER: sleep until a host writes. `due_ns`:
  * next punctual event; `easy_ns`: next event that need not be punctual. Polling is punctual but uses the processor. It
- * is limited to a sixth of the time by which the process waits longer than it works. */
+ * is limited to a twentieth of the time by which the process waits longer than it works. */
 int64_t line_sleep_ns(PollBudget *p, int64_t due_ns, int64_t now_ns, int64_t easy_ns)
 {
     int64_t spent_ns = (now_ns - p->woken_ns) / POLL_SHARE, left_ns = due_ns - now_ns;
@@ -1818,6 +1880,8 @@ int32_t line_serve(Server *s)
     }
     int32_t news = s->news;
     s->news = 0;
+    for (int32_t i = 0; i < s->count; i++)
+        news |= s->terminals[i]->bus->line.raised ? RAISED : 0;
     return news;
 }
 
