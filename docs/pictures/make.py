@@ -195,6 +195,13 @@ class Maker:
         printed(words, self.place)
         (self.into / "fall.svg").write_text(drawn.fall(self._log))
 
+    def reach(self) -> None:
+        """Draw where the gripper of an arm gets to."""
+        printed(
+            ("reach", "robots/open_manipulator_x_space.yaml", "end_effector_link", "reach.png"), self.place
+        )
+        self._kept("reach", base64.b64encode((self.place / "reach.png").read_bytes()).decode())
+
     def cycle(self) -> None:
         """Look into a cycle of the torso."""
         # The goals of a motion change, so the cycle has a write. Its goals are not reached in 3 s.
@@ -310,6 +317,7 @@ MADE: dict[str, Callable[[Maker], None]] = {
     "lost": Maker.lost,
     "fall": Maker.fall,
     "cycle": Maker.cycle,
+    "reach": Maker.reach,
     "setup": Maker.setup,
     "calibrate": Maker.calibrate,
     "teach": Maker.teach,

@@ -10,9 +10,9 @@ from pydantic import ValidationError
 from dxlrun.tooling.features import Compilation, CompileStage, Contribution, Row
 from dxlrun_space import form
 from dxlrun_space.chain import IDENTITY, Chain, Pose, WrongChain
-from dxlrun_space.path import MotionLimits, NoPath, Path, Planning, plan_joints
+from dxlrun_space.path import out_of_reach, suffices
 from dxlrun_space.reach import dexterity
-from dxlrun_space.solver import Solver
+from dxlrun_space.solver import Search, Solution, Solver
 from dxlrun_space.space_goals import PoseCommand, flat_pose, read_pose
 
 _GOAL: Final = {"x", "y", "z", "rpy", "quaternion"}
@@ -61,31 +61,35 @@ def _solved(compilation: Compilation, pose: form.TipPose) -> Row | None:
         raise WrongChain("", what, fix or "remove the others") from None
     exact = goal.asks_orientation and len(plans) >= _FULL
     target = goal.target(_BASE, chain.pose(start))
-    any_speed = (1.0,) * len(plans)
-    path = _finished(
-        plan_joints(solver, start, target, MotionLimits(any_speed, any_speed, 1, 1, 1, 1), exact=exact)
+    search = (
+        solver.search(target, start, exact=exact)
+        if goal.asks_orientation
+        else solver.search_place(target, start)
     )
-    if isinstance(path, NoPath):
-        raise WrongChain("", path.text, "move the pose, or give it another orientation")
-    ends = zip(path.last, solver.lower, solver.upper, strict=True)
+    found = _finished(search)
+    if not suffices(found.residual, exact):
+        raise WrongChain(
+            "", out_of_reach(found.residual, exact), "move the pose, or give it another orientation"
+        )
+    ends = zip(found.positions, solver.lower, solver.upper, strict=True)
     margins = [min(at - low, high - at) for at, low, high in ends]
     least = margins.index(min(margins))
     return {
-        "joints": dict(zip(chain.joints, path.last, strict=True)),
-        "orientation_error": path.residual.orientation if goal.asks_orientation else 0.0,
-        "dexterity": dexterity(chain, [path.last])[0],
+        "joints": dict(zip(chain.joints, found.positions, strict=True)),
+        "orientation_error": found.residual.orientation if goal.asks_orientation else 0.0,
+        "dexterity": dexterity(chain, [found.positions])[0],
         "margin": margins[least],
         "margin_joint": chain.joints[least],
         "margin_unit": plans[least].unit.si,
     }
 
 
-def _finished(planning: Planning) -> Path | NoPath:
+def _finished(search: Search) -> Solution:
     while True:
         try:
-            next(planning)
+            next(search)
         except StopIteration as done:
-            found: Path | NoPath = done.value
+            found: Solution = done.value
             return found
 
 

@@ -150,8 +150,8 @@ def plan_joints(
 ) -> Planning:
     """Plan a motion in which all joints turn evenly from the start to the pose."""
     found = yield from solver.search(target, start, exact=exact)
-    if not _suffices(found.residual, exact):
-        return NoPath(_out_of_reach(found.residual, exact))
+    if not suffices(found.residual, exact):
+        return NoPath(out_of_reach(found.residual, exact))
     ways = [b - a for a, b in zip(start, found.positions, strict=True)]
     count = _count(max(map(abs, ways)) / _NODE_RAD)
     places = [index / count for index in range(count + 1)]
@@ -165,8 +165,8 @@ def plan_line(
     """Plan a motion in which the tip moves on a straight line and turns about one axis to the pose."""
     search = solver.search(target, start, exact=True) if exact else solver.search_place(target, start)
     found = yield from search
-    if not _suffices(found.residual, exact):
-        return NoPath(_out_of_reach(found.residual, exact))
+    if not suffices(found.residual, exact):
+        return NoPath(out_of_reach(found.residual, exact))
     begin = solver.chain.pose(start)
     way, turn = distance(begin, target)
     length = math.hypot(*way)
@@ -183,7 +183,7 @@ def plan_line(
         change = max(abs(a - b) for a, b in zip(found.positions, nodes[-1], strict=True))
         bend = _bend([*places[-2:], place], [*nodes[-2:], found.positions])
         smooth = change <= _JUMP_RAD and bend <= _BEND_RAD
-        if _suffices(found.residual, exact) and smooth:
+        if suffices(found.residual, exact) and smooth:
             places.append(place)
             nodes.append(found.positions)
             step = min(2 * step, 1.0 / count)
@@ -199,12 +199,14 @@ def plan_line(
     return (yield from _timed(solver, places, nodes, target, limits))
 
 
-def _out_of_reach(residual: Residual, exact: bool) -> str:
+def out_of_reach(residual: Residual, exact: bool) -> str:
+    """Return the reason why a pose is refused, with the distance of the nearest solution."""
     turn = f" and {math.degrees(residual.orientation):.1f} deg" if exact else ""
     return f"the pose is out of reach; the nearest is {residual.position * 1e3:.1f} mm{turn} away"
 
 
-def _suffices(residual: Residual, exact: bool) -> bool:
+def suffices(residual: Residual, exact: bool) -> bool:
+    """Return True if a solution has the position and, if `exact`, the orientation."""
     return residual.is_close if exact else residual.position <= CLOSE_M
 
 

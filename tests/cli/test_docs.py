@@ -59,6 +59,7 @@ TESTS = {
     "replay.md": ("tests/analysis/replay/test_command_line.py",),
     "sensors.md": ("tests/sensors/test_page.py",),
     "standard-controllers.md": ("tests/space/test_page.py",),
+    "space.md": ("tests/space/test_tutorial.py",),
     "steering.md": ("tests/cli/test_steer.py",),
     "teleoperation.md": ("tests/teleop/test_page.py", "tests/teleop/test_terminal.py"),
     "network.md": ("tests/remote/test_network_run.py",),

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.kit.awaited import DEADLINE_S, until
-from tests.kit.pages import page_text
+from tests.kit.pages import page_text, shows
 
 from dxlrun.testing import read_log
 
@@ -42,15 +42,6 @@ STARTS = 3
 """Of a robot: where the machine is busy, its servos may answer too late."""
 pytestmark = [pytest.mark.long, pytest.mark.timeout(300)]
 """Robots of whole pages, one after the other, in real time."""
-
-
-def shows(block: str, printed: str) -> bool:
-    """Return whether a block of a page is what was printed; the number of spaces does not count."""
-    pattern = ""
-    for line in block.splitlines():
-        words = re.escape(" ".join(line.split())).replace(r"\.\.\.", ".*")
-        pattern += r"(.*\n)*" if line.strip() == "..." else f"{words} ?\\n"
-    return bool(re.fullmatch(pattern, "".join(f"{' '.join(one.split())}\n" for one in printed.splitlines())))
 
 
 class Reader:

@@ -40,11 +40,10 @@ RAD_PER_TICK = np.radians(300) / 1023
 
 @pytest.fixture(autouse=True)
 def with_backlash(project: Callable[..., Path]) -> Iterator[None]:
-    """Install the package whose files are on the page, and the layer that the page names."""
+    """Install the package whose files are on the page, or named there."""
     section = PAGE.read_text().partition("## A key of joints")[2]
-    texts = re.findall(r"```python\n(.*?)```", section, re.S)
-    layer = Path(__file__).with_name("backlash").joinpath("layer.py").read_text()
-    files = {**dict(zip(("joint_key", "compile"), texts, strict=False)), "layer": layer}
+    files = {path.stem: path.read_text() for path in Path(__file__).with_name("backlash").glob("*.py")}
+    files["joint_key"] = re.findall(r"```python\n(.*?)```", section, re.S)[0]
     with installed(project("backlash", **files)):
         yield
     robot_form.cache_clear()

@@ -28,3 +28,12 @@ def page_commands(name: str, section: str = "") -> list[list[str]]:
 def page_blocks(name: str, language: str) -> list[str]:
     """Return the blocks of a language on a page."""
     return re.findall(rf"^```{language}\n(.*?)^```$", page_text(name), re.MULTILINE | re.DOTALL)
+
+
+def shows(block: str, printed: str) -> bool:
+    """Return whether a block of a page is what was printed; the number of spaces does not count."""
+    pattern = ""
+    for line in block.splitlines():
+        words = re.escape(" ".join(line.split())).replace(r"\.\.\.", ".*")
+        pattern += r"(.*\n)*" if line.strip() == "..." else f"{words} ?\\n"
+    return bool(re.fullmatch(pattern, "".join(f"{' '.join(one.split())}\n" for one in printed.splitlines())))

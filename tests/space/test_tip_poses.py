@@ -44,6 +44,7 @@ def test_joints_of_each_pose_have_it_and_its_row_is_true(name: str) -> None:
         matrix = arm.matrix(at)
         assert matrix[:3, 3] == pytest.approx(np.array(written[:3]) / 100, abs=1e-4)
         assert arm.within(at)
+        assert name != "op3_space" or (at[0] > 0 and at[2] > 0)  # the solution that is `near`
         if len(written) > 3:
             roll, pitch, yaw = map(math.radians, written[3:])
             asked = turn((0, 0, 1), yaw) @ turn((0, 1, 0), pitch) @ turn((1, 0, 0), roll)
