@@ -261,7 +261,7 @@ class Story:
         held: deque[tuple[int, bytes]] = deque()
         drain, due = bus.drain_bytes, bus.next_due_ns
 
-        def drain_late(now_ns: int, *, handed_ns: int | None = None) -> bytes:
+        def drain_late(now_ns: int, *, handed_ns: int = -1) -> bytes:
             if data := drain(now_ns, handed_ns=handed_ns):
                 self.evidence["handed over late"] += late_ns(now_ns) > 0
                 held.append((max(now_ns + late_ns(now_ns), held[-1][0] if held else 0), data))
