@@ -23,7 +23,7 @@ _NODE_M: Final = 0.004
 """Distance of two nodes of a straight line, m: on an arc of 0.2 m radius the middle is 0.01 mm off."""
 _NODE_RAD: Final = 0.05
 """Distance of two nodes where the tip or a joint turns, rad."""
-_FEWEST_NODES, _MOST_NODES, _MOST_SPLIT = 12, 100, 600
+_FEWEST_NODES, _MOST_NODES, _MOST_SPLIT = 12, 100, 200
 _SPLITS: Final = 7
 """Number of times that the distance of two nodes may be halved near a singularity."""
 _JUMP_RAD: Final = 0.06

@@ -47,8 +47,8 @@ _LONGEST_STEP: Final = 1.0
 """Largest change of a joint in a step, rad or m: the linear model is not valid for more."""
 _STILL: Final = 1e-7
 """Change of all joints below which a search has converged, rad or m."""
-_DAMPING: Final = (1e-3, 1e-12, 1e3)
-"""First, smallest and largest damping, as a fraction of the square of the arm's length."""
+_DAMPING: Final = (1e-3, 1e-7, 1e-12, 1e3)
+"""First damping, that of a start near the solution, smallest, and largest: parts of the squared length."""
 _POSE: Final = 6
 """Degrees of freedom of a pose. Joints in addition leave a choice."""
 _PRIMES: Final = (2, 3, 5, 7, 11, 13, 17, 19, 23)
@@ -226,7 +226,8 @@ class Solver:
     ) -> Search:
         scale, limits = self.chain.length, (self.lower, self.upper) if is_limited else self._unlimited
         weight = (weight * scale) ** 2
-        damping, least, most = (each * scale * scale for each in _DAMPING)
+        first, near, least, most = (each * scale * scale for each in _DAMPING)
+        damping = near if is_patient else first
         now = _inside(start, limits)
         posture = [
             a if b is None else min(max(b, a - leash), a + leash)

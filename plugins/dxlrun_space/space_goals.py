@@ -55,7 +55,7 @@ def _floats(value: object) -> object:
 
 def _rad(value: object) -> object:
     if isinstance(value, str):
-        return 0.0 if value in ("0", "0.0") else _angle.validate_python(value)
+        value = 0.0 if value in ("0", "0.0") else _angle.validate_python(value)
     if isinstance(value, int | float) and abs(value) > 2 * math.pi:
         raise ValueError(f"{value:g} rad is more than a turn; write the unit, such as {value:g}deg")
     return value

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from tests.kit.campaigns import campaign
+from tests.kit.stories import replayed
 from tests.kit.wire import all_writes
 
 from dxlrun.channels.commands import LOOP, CommandMessage, QueueInbox
@@ -89,12 +90,15 @@ class Clients(QueueInbox):
         self.waiting.append(CommandMessage(next(self._numbers), "arm", kind, data, client, lease_ns))
 
 
-@campaign(ci=4, night=300, release=3600)
-def test_hostile_goals_are_within_the_limits_of_the_joints(amount: float, chance: random.Random) -> None:
+@campaign(ci=4, night=120, release=600)
+def test_hostile_goals_are_within_the_limits_of_the_joints(
+    amount: float, chance: random.Random, tmp_path: Path
+) -> None:
     plan = plan_of(ROBOT, arguments={"rate": "200"}, duration_s=amount)
-    robot = VirtualRobot(plan, inbox=Clients(plan, chance))
+    robot = VirtualRobot(plan, inbox=Clients(plan, chance), log=tmp_path / "run.mcap")
     result = robot.run()
     assert (result.reason, result.detail) == ("ended", "")
+    replayed(tmp_path / "run.mcap")
     (bus,) = plan.buses
     goals: dict[int, list[tuple[int, int]]] = {}
     for t_ns, servo, address, data in all_writes(tuple(robot.ledger.entries), bus):
