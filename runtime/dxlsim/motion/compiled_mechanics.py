@@ -14,7 +14,7 @@ from dxlwire.compiled import load_compiled, parse_structs
 
 SOURCE = Path(__file__).with_name("mechanics.c")
 STRUCTS = parse_structs(SOURCE.read_text())
-SERVO, JOINT = (np.dtype(STRUCTS[name]) for name in ("Servo", "Joint"))
+SERVO, JOINT, AIM = (np.dtype(STRUCTS[name]) for name in ("Servo", "Joint", "Aim"))
 
 
 @unique
@@ -68,16 +68,21 @@ def library() -> ctypes.PyDLL:
     """
     found = load_compiled(SOURCE, ctypes.PyDLL)
     for name, result, arguments in (
+        ("aim", None, (c_void_p, c_int64, c_double, c_double, c_double)),
         ("angle", c_double, (c_void_p,)),
         ("check_rest", None, (c_void_p,)),
         ("drive", None, (c_void_p,)),
         ("end_step", None, (c_void_p,)),
+        ("follow", c_int32, (c_void_p,)),
         ("is_moving", c_int32, (c_void_p,)),
+        ("next_action", c_int64, (c_void_p,)),
+        ("plan", c_int32, (c_void_p, c_int32)),
         ("position_tick", c_double, (c_void_p, c_double)),
         ("show", None, (c_void_p, c_int64, c_int32, c_int32)),
         ("step_joints", None, (c_void_p, c_void_p, c_void_p, c_void_p, c_void_p, c_int64, c_double)),
         ("step_to", c_int32, (c_void_p, c_int64)),
-        ("whole_turns", c_double, (c_void_p, c_double)),
+        ("take_goal", c_int32, (c_void_p, c_int64)),
+        ("withdraw", None, (c_void_p, c_int64)),
         ("stribeck", None, (c_void_p, c_void_p, c_void_p, c_int64)),
     ):
         function = getattr(found, f"motion_{name}")

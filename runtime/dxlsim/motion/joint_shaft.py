@@ -6,10 +6,10 @@ import math
 from collections.abc import Mapping
 
 from dxlsim.motion.compiled_mechanics import Counting, ShownQuantity
-from dxlsim.motion.control_law import FREE, ServoCommand
+from dxlsim.motion.control_law import ServoCommand
 from dxlsim.motion.mechanics import Mechanics
 from dxlsim.motion.motor import Motor
-from dxlsim.motion.shaft import LiveItem, Shaft, Trajectory
+from dxlsim.motion.shaft import LiveItem, Shaft
 from dxlsim.registers.access import ACCESS, multi_turn_mode, wheel_mode
 from dxlsim.registers.memory import Memory
 from dxlsim.simulation_plan import Load
@@ -52,9 +52,11 @@ class JointShaft(Shaft):
 
     def __init__(self, memory: Memory, mechanics: Mechanics, motor: Motor, load: Load, angle: float) -> None:
         super().__init__(memory, mechanics, motor, load, angle)
-        self._turns_apart = 0.0
-        """Whole turns between the shaft's angle and the turn in which joint mode counts, rad."""
-        self._aimed: tuple[int, int, int] = (0, 0, 0)
+        items = memory.table.items
+        self.take_goal_items(("goal_position", "moving_speed", "goal_acceleration"))
+        self.state.speed_unit = memory.table.rad_s_per_tick
+        if "goal_acceleration" in items:
+            self.state.acceleration_unit = items["goal_acceleration"].scale
         self.state.highest_tick = memory.table.max_tick
         self.state.noticed_speed = memory.table.rad_s_per_tick / 2
         memory.watch_items(_OF_COUNTING, self._count)
@@ -100,26 +102,6 @@ class JointShaft(Shaft):
     @property
     def _controls_position(self) -> bool:
         return not wheel_mode(self.memory) and not self.memory.get("torque_ctrl_mode_enable")
-
-    def _new_trajectory(self, *, afresh: bool = False) -> Trajectory | None:
-        memory, table = self.memory, self.memory.table
-        aimed = (memory["goal_position"], memory["moving_speed"], memory.get("goal_acceleration"))
-        if aimed == self._aimed and not afresh:
-            return None
-        if afresh:
-            self._turns_apart = self._library.motion_whole_turns(self.address, self.angle)
-        self._aimed = aimed
-        if multi_turn_mode(memory):
-            signed = aimed[0] - (aimed[0] >> 15 << 16)
-            ticks = (signed - memory.ticks("multi_turn_offset")) * memory["resolution_divider"]
-            goal = ticks * table.rad_per_tick
-        else:
-            goal = aimed[0] * table.rad_per_tick + self._turns_apart
-        speed = (
-            abs(memory.ticks("moving_speed")) * table.rad_s_per_tick or FREE
-        )  # The direction bit has no effect [i]
-        ramp = aimed[2] * table.items["goal_acceleration"].scale if aimed[2] else FREE
-        return goal, speed, ramp
 
     def _command(self) -> ServoCommand:
         memory, table = self.memory, self.memory.table

@@ -9,7 +9,7 @@
  * same law on the integrated speed: its I gain takes the place of P, its P gain that of D. The motor's torque is
  * `duty * stall torque - damping * velocity`.
  *
- * `motion_show` writes the motion into the registers of a servo, in ticks.
+ * `motion_show` writes the motion into the registers of a servo, in ticks; `motion_take_goal` takes a new goal from them.
  *
  * Arithmetic is IEEE double in source order, built with -ffp-contract=off, so that a simulation has the same bits on
  * every machine with the same `sin`, `exp` and `pow`. NaN spreads through `least` and `most`, as in numpy.
@@ -17,6 +17,7 @@
 
 #include <math.h>
 #include <stdint.h>
+#include <string.h>
 
 #ifndef SOURCE_CRC
 #define SOURCE_CRC 0 /* CRC-32 of this file. mechanics.py parses the structs here, and refuses an outdated object. */
@@ -29,15 +30,20 @@
 #define UNDRIVEN 1e-8   /* rad/s, change of the speed in a step */
 #define STEADY_C 1e-7   /* degrees C in a tick; a smaller change has no visible effect in years */
 #define TAU 6.283185307179586
+#define FREE 1e6        /* unreachable limit, as in control_law.py */
 #define NEAR_TICKS 10   /* distance that counts as "in position"; the manual of the X series gives no value [i] */
 #define IN_POSITION 1   /* bits of Moving Status (123) */
 #define ON_THE_WAY 2
+#define RECTANGULAR 0x10
+#define TRIANGULAR 0x20
+#define TRAPEZOIDAL 0x30
 
 enum { DONE, ACTION, STRAINED, STEP }; /* results of motion_step_to: `StepResult` of compiled_mechanics.py */
 
 /* Quantities that registers show, and how positions are counted: `ShownQuantity` and `Counting` of compiled_mechanics.py */
 enum { POSITION, VELOCITY, SETPOINT, SETPOINT_VELOCITY, DUTY, CURRENT, MOVING, MOVING_STATUS, TEMPERATURE, VOLTAGE, TIME };
 enum { ENDLESS, JOINT, WHEEL, TURNS };
+enum { UNSIGNED, TWOS_COMPLEMENT, SIGN_MAGNITUDE }; /* encodings of a register */
 
 typedef struct { /* one servo: its command, trajectory, controller, motor and temperature; angles are the shaft's */
     double goal, speed, acceleration, turning, p_ccw, p_cw, margin_ccw, margin_cw, punch; /* ServoCommand of */
@@ -65,6 +71,11 @@ typedef struct { /* one shaft of IndependentJoints with its motor and load, as P
     double stribeck[3];                   /* Nm, rad/s, exponent; 0 Nm: none */
 } Joint;
 
+typedef struct { /* new goal of a servo, which takes effect later */
+    int64_t t_ns, order, index;
+    double goal, speed, acceleration;
+} Aim;
+
 typedef struct {
     Servo *servos;
     Joint *joints;          /* NULL: the plant is not IndependentJoints, so Python steps it */
@@ -79,6 +90,9 @@ typedef struct {
     double ambient_c, stalled_rise_c; /* degrees C: see mechanics.py */
     double overload_part;             /* fraction of the torque allowed by the limit, above it is an overload */
     int64_t overload_ticks;           /* tolerated duration of an overload */
+    Aim *aims;              /* in the order of their times */
+    int64_t aim_count, aim_room;
+    int64_t order, agenda_order; /* number of the next action or aim, and of the next action of Python */
     int32_t hands;          /* number of shafts that are turned by hand, which Python does */
     int32_t busy;           /* 1: Python acts, and may read the time but not advance it */
     int32_t still;          /* 1: all servos rest without new commands */
@@ -94,8 +108,12 @@ typedef struct { /* register that shows a quantity, rounded to ticks */
     int32_t sign_bit;              /* bit of a negative sign, which limits the magnitude to `highest`; -1: none */
 } LiveItem;
 
+typedef struct { /* register of a goal; size 0: the model lacks it */
+    int32_t address, size, encoding, unused;
+} GoalItem;
+
 typedef struct { /* shaft of one servo, as its registers show it */
-    const Mechanics *mechanics;
+    Mechanics *mechanics;
     uint8_t *memory;               /* registers */
     const LiveItem *items;
     int64_t item_count, index;     /* `index`: of the servo in the mechanics */
@@ -106,6 +124,13 @@ typedef struct { /* shaft of one servo, as its registers show it */
     double noticed_speed;          /* rad/s from which the shaft counts as moving */
     double torque_per_ampere;      /* Nm/A */
     double voltage, supply_ohm;    /* V of the supply without load, and the resistance of its cable */
+    GoalItem goal_items[3];        /* position, speed and acceleration of the trajectory */
+    int64_t aimed[3];              /* their values for the current trajectory */
+    int64_t response_delay_ns;     /* delay until a goal takes effect */
+    double speed_unit, acceleration_unit; /* rad/s and rad/s^2 per tick */
+    double turns_apart;            /* whole turns between the shaft's angle and the turn of joint mode, rad */
+    double next[3];                /* new trajectory: goal, speed, acceleration */
+    int32_t time_based;            /* 1: speed and acceleration are durations in ms */
     int32_t counting;
     int32_t goes_to_goal, turns;   /* 1: the command has a goal; 1: it has a speed */
     int32_t profile_kind;          /* bits of Moving Status */
@@ -314,10 +339,53 @@ void motion_end_step(Mechanics *m)
     end_step(m, 1);
 }
 
+/* Time of the next action or aim; INT64_MAX: none. */
+int64_t motion_next_action(const Mechanics *m)
+{
+    return m->aim_count && m->aims[0].t_ns < m->agenda_ns ? m->aims[0].t_ns : m->agenda_ns;
+}
+
+/* Change only a servo's goal, rad, and the speed, rad/s, and acceleration, rad/s^2, of its trajectory. */
+void motion_aim(Mechanics *m, int64_t index, double goal, double speed, double acceleration)
+{
+    Servo *s = &m->servos[index];
+    s->goal = goal;
+    s->speed = speed;
+    s->acceleration = acceleration;
+    m->calm = m->still = m->arrived = 0;
+}
+
+/* Do the aims that are due before the next action of Python. */
+static void do_aims(Mechanics *m)
+{
+    int64_t done = 0;
+    for (; done < m->aim_count; done++) {
+        const Aim *a = &m->aims[done];
+        int later = a->t_ns > m->agenda_ns || (a->t_ns == m->agenda_ns && a->order > m->agenda_order);
+        if (a->t_ns > m->grid_ns || later)
+            break;
+        motion_aim(m, a->index, a->goal, a->speed, a->acceleration);
+    }
+    if (done) {
+        m->aim_count -= done;
+        memmove(m->aims, m->aims + done, (size_t)m->aim_count * sizeof(Aim));
+    }
+}
+
+/* Withdraw the aims of a servo that have not taken effect. */
+void motion_withdraw(Mechanics *m, int64_t index)
+{
+    int64_t kept = 0;
+    for (int64_t i = 0; i < m->aim_count; i++)
+        if (m->aims[i].index != index)
+            m->aims[kept++] = m->aims[i];
+    m->aim_count = kept;
+}
+
 /* Number of steps to skip while all servos rest: up to the next action or change of temperature. */
 static int64_t resting_steps(const Mechanics *m, int64_t now_ns)
 {
-    int64_t until_ns = m->agenda_ns < now_ns ? m->agenda_ns : now_ns;
+    int64_t action_ns = motion_next_action(m), until_ns = action_ns < now_ns ? action_ns : now_ns;
     if (!m->calm && m->strain_ns < until_ns)
         until_ns = m->strain_ns;
     int64_t steps = (until_ns - m->grid_ns) / m->step_ns;
@@ -333,6 +401,7 @@ int32_t motion_step_to(Mechanics *m, int64_t now_ns)
     if (m->news)
         return STRAINED;
     while (m->grid_ns + m->step_ns <= now_ns) {
+        do_aims(m);
         if (m->agenda_ns <= m->grid_ns)
             return ACTION;
         if (m->still || !m->count)
@@ -477,4 +546,112 @@ void motion_show(Shaft *s, int64_t now_ns, int32_t address, int32_t length)
         for (int32_t byte = 0; byte < item->size; byte++)
             s->memory[item->address + byte] = (uint8_t)(value >> 8 * byte);
     }
+}
+
+static int64_t goal_value(const Shaft *s, int32_t which)
+{
+    const GoalItem *item = &s->goal_items[which];
+    int64_t value = 0;
+    for (int32_t i = 0; i < item->size; i++)
+        value |= (int64_t)s->memory[item->address + i] << 8 * i;
+    if (item->encoding == TWOS_COMPLEMENT && item->size && value >> (8 * item->size - 1))
+        value -= (int64_t)1 << 8 * item->size;
+    if (which) /* of speed and acceleration only the magnitude counts */
+        value = item->encoding == SIGN_MAGNITUDE ? value & 1023 : value < 0 ? -value : value;
+    return value;
+}
+
+static int32_t kind_of_profile(double ramp, double distance, double speed, double acceleration)
+{
+    if (ramp == 0.0)
+        return RECTANGULAR;
+    return distance * acceleration > speed * speed ? TRAPEZOIDAL : TRIANGULAR;
+}
+
+/* Trajectory of a move with a duration and an acceleration time, s; the latter is at most half as long. */
+static void plan_timed(Shaft *s, double distance, double duration, double ramp)
+{
+    if (distance == 0.0)
+        return;
+    ramp = least(ramp, duration / 2);
+    s->next[1] = distance / (duration - ramp);
+    s->next[2] = ramp != 0.0 ? s->next[1] / ramp : FREE;
+    s->profile_kind = kind_of_profile(ramp, distance, s->next[1], s->next[2]);
+}
+
+/* Trajectory of servos with a profile: Profile Velocity 0 disables it (a step), Profile Acceleration 0 makes it
+ * rectangular (e-Manual, X series, Profile Velocity (112)). */
+static void plan_profile(Shaft *s, double velocity, double ramp)
+{
+    s->next[0] = s->sign * (double)(s->aimed[0] - s->offset) * s->rad_per_tick;
+    double distance = fabs(s->next[0] - s->mechanics->servos[s->index].setpoint);
+    if (velocity == 0.0)
+        s->profile_kind = 0;
+    else if (s->time_based)
+        plan_timed(s, distance, velocity * 1e-3, ramp * 1e-3);
+    else {
+        s->next[1] = velocity * s->speed_unit;
+        s->next[2] = ramp != 0.0 ? ramp * s->acceleration_unit : FREE;
+        s->profile_kind = kind_of_profile(ramp, distance, s->next[1], s->next[2]);
+    }
+}
+
+/* Plan the trajectory that the registers ask for as `next`. Return 0 if it has not changed, unless `afresh`. */
+int32_t motion_plan(Shaft *s, int32_t afresh)
+{
+    int64_t aimed[3] = {goal_value(s, 0), goal_value(s, 1), goal_value(s, 2)};
+    double velocity = (double)aimed[1], ramp = (double)aimed[2];
+    if (!afresh && !memcmp(aimed, s->aimed, sizeof aimed))
+        return 0;
+    if (afresh && s->counting != ENDLESS)
+        s->turns_apart = motion_whole_turns(s, motion_angle(s));
+    memcpy(s->aimed, aimed, sizeof aimed);
+    s->next[1] = s->next[2] = FREE;
+    if (s->counting == ENDLESS) {
+        plan_profile(s, velocity, ramp);
+        return 1;
+    }
+    if (s->counting == TURNS) { /* the goal is in two's complement */
+        double signed_goal = (double)(aimed[0] - (aimed[0] >> 15 << 16));
+        s->next[0] = (signed_goal - (double)s->offset) * s->divider * s->rad_per_tick;
+    } else
+        s->next[0] = (double)aimed[0] * s->rad_per_tick + s->turns_apart;
+    if (velocity != 0.0) /* 0: no limit */
+        s->next[1] = velocity * s->speed_unit;
+    if (ramp != 0.0)
+        s->next[2] = ramp * s->acceleration_unit;
+    return 1;
+}
+
+/* Let the planned trajectory take effect after the response delay, at the next point of the grid. Return 0 without room
+ * for another aim.
+ *
+ * It is up to a step late, half a step on average. That compensates the lead of a plant, which updates its velocity
+ * first. */
+int32_t motion_follow(Shaft *s)
+{
+    Mechanics *m = s->mechanics;
+    int64_t at = m->aim_count;
+    Aim aim = {s->now_ns + s->response_delay_ns, m->order, s->index, s->next[0], s->next[1], s->next[2]};
+    if (at == m->aim_room)
+        return 0;
+    m->order++;
+    m->aim_count++;
+    for (; at && m->aims[at - 1].t_ns > aim.t_ns; at--)
+        m->aims[at] = m->aims[at - 1];
+    m->aims[at] = aim;
+    return 1;
+}
+
+/* Follow goals at `now_ns` that were written into the registers. Return 0 if Python must do it: the servo does not
+ * control a position, or there is no room for another aim. */
+int32_t motion_take_goal(Shaft *s, int64_t now_ns)
+{
+    if (!s->goes_to_goal || s->mechanics->aim_count == s->mechanics->aim_room)
+        return 0;
+    if (now_ns > s->now_ns)
+        s->now_ns = now_ns;
+    if (motion_plan(s, 0))
+        motion_follow(s);
+    return 1;
 }

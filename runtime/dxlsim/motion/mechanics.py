@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import ctypes
 import heapq
-import itertools
 import math
 from collections.abc import Callable
 from functools import partial
@@ -16,7 +15,7 @@ from importlib.metadata import entry_points
 import msgspec
 import numpy as np
 
-from dxlsim.motion.compiled_mechanics import SERVO, STRUCTS, StepResult, library
+from dxlsim.motion.compiled_mechanics import AIM, SERVO, STRUCTS, StepResult, library
 from dxlsim.motion.control_law import LIMP, ServoCommand
 from dxlsim.motion.coupled_joints import joints_without_bodies
 from dxlsim.motion.link_motion import Shafts
@@ -47,6 +46,7 @@ OVERLOAD_PART = 0.8
 OVERLOAD_TICKS = 10  # Tolerated duration in intervals of STRAIN_NS: a second [i]
 
 _NEVER = 2**63 - 1
+_AIMS = 64  # Room for goals that have not taken effect, at first
 _COMMAND = [*ServoCommand._fields]
 
 SUPPLY_OHM = 0.1  # Resistance of cable and connectors between supply and servo [i]
@@ -70,7 +70,6 @@ class Mechanics:
         self._recounted: list[float] = []
         self._watchers: dict[int, Callable[[], None]] = {}
         self._agenda: list[tuple[int, int, Callable[[], None]]] = []
-        self._order = itertools.count()
         self._hands: dict[int, _Hand] = {}
         self._state = STRUCTS["Mechanics"](
             step_ns=STEP_NS,
@@ -87,6 +86,7 @@ class Mechanics:
             overload_ticks=OVERLOAD_TICKS,
         )
         self._library = library()
+        self._aims = np.zeros(0, dtype=AIM)
         self.address = ctypes.addressof(self._state)
         """Address of the struct `Mechanics` of mechanics.c."""
         self.servos = np.zeros(0, dtype=SERVO)
@@ -161,9 +161,18 @@ class Mechanics:
     def aim(self, index: int, goal: float, speed: float, acceleration: float) -> None:
         """Change only a servo's goal, rad, and the speed, rad/s, and acceleration, rad/s^2, of its
         trajectory."""
-        servo = self.servos[index]
-        servo["goal"], servo["speed"], servo["acceleration"] = goal, speed, acceleration
-        self._wake()
+        self._library.motion_aim(self.address, index, goal, speed, acceleration)
+
+    def follow_plan(self, shaft_address: int) -> None:
+        """Let the trajectory that was planned for a `Shaft` of mechanics.c take effect after its response
+        delay."""
+        while not self._library.motion_follow(shaft_address):
+            self._aims = np.resize(self._aims, 2 * len(self._aims) + _AIMS)
+            self._state.aims, self._state.aim_room = self._aims.ctypes.data, len(self._aims)
+
+    def withdraw(self, index: int) -> None:
+        """Withdraw the trajectories of a servo that have not taken effect."""
+        self._library.motion_withdraw(self.address, index)
 
     def move_shaft(self, index: int, angle: float) -> None:
         """Move a resting shaft to an angle, rad, at once; its trajectory begins there."""
@@ -229,8 +238,9 @@ class Mechanics:
 
     def call_at(self, t_ns: int, action: Callable[[], None]) -> None:
         """Call `action` at the first grid point at or after `t_ns`."""
-        heapq.heappush(self._agenda, (t_ns, next(self._order), action))
-        self._state.agenda_ns = self._agenda[0][0]
+        heapq.heappush(self._agenda, (t_ns, self._state.order, action))
+        self._state.order += 1
+        self._state.agenda_ns, self._state.agenda_order, _ = self._agenda[0]
 
     def due_ns(self) -> int | None:
         """Return the time at which `step_to` must be called in real time, even without requests of hosts;
@@ -239,7 +249,8 @@ class Mechanics:
             return None
         if not self.still:
             return self.grid_ns + EAGER_NS
-        agenda_ns = self._agenda[0][0] + STEP_NS if self._agenda else None
+        next_ns = self._library.motion_next_action(self.address)
+        agenda_ns = None if next_ns == _NEVER else next_ns + STEP_NS
         if self._state.calm:
             return agenda_ns
         easy_ns = self.grid_ns + EASY_NS
@@ -261,7 +272,8 @@ class Mechanics:
 
     def _act(self) -> None:
         _, _, action = heapq.heappop(self._agenda)
-        self._state.agenda_ns = self._agenda[0][0] if self._agenda else _NEVER
+        head = self._agenda[0] if self._agenda else (_NEVER, 0)
+        self._state.agenda_ns, self._state.agenda_order = head[:2]
         action()
 
     def _call_watchers(self) -> None:

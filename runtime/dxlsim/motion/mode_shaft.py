@@ -9,7 +9,7 @@ from dxlsim.motion.compiled_mechanics import ShownQuantity
 from dxlsim.motion.control_law import FREE, LIMP, ServoCommand
 from dxlsim.motion.mechanics import Mechanics
 from dxlsim.motion.motor import Motor
-from dxlsim.motion.shaft import LiveItem, Shaft, Trajectory, critical_d
+from dxlsim.motion.shaft import LiveItem, Shaft, critical_d
 from dxlsim.registers.access import ACCESS, OperatingMode, watchdog_expired
 from dxlsim.registers.memory import Memory
 from dxlsim.simulation_plan import Load
@@ -22,10 +22,6 @@ _OF_POSITION = (
     OperatingMode.EXTENDED_POSITION,
     OperatingMode.CURRENT_BASED_POSITION,
 )
-
-_RECTANGULAR, _TRIANGULAR, _TRAPEZOIDAL = 0x10, 0x20, 0x30
-"""Bits of Moving Status (123): kind of the profile."""
-
 
 SAMPLING_S = 1e-3
 """Sampling period (s) in the e-Manual's conversions of gains, which mention it without a value (X series,
@@ -55,7 +51,6 @@ class ModeShaft(Shaft):
 
     def __init__(self, memory: Memory, mechanics: Mechanics, motor: Motor, load: Load, angle: float) -> None:
         super().__init__(memory, mechanics, motor, load, angle)
-        self._aimed: tuple[int, int, int] = (0, 0, 0)
         items = memory.table.items
         self._speed_item = memory.table.goal_speed_item
         """Name of the item with the profile's speed: on PRO Goal Velocity (600), with Goal Acceleration
@@ -70,6 +65,9 @@ class ModeShaft(Shaft):
         self._scale = {name: item.scale for name, item in items.items()}
         self._rad_per_tick = memory.table.rad_per_tick
         self._sign, self._offset = 1, 0
+        self.take_goal_items(("goal_position", self._speed_item, self._ramp_item))
+        self.state.speed_unit = memory.table.rad_s_per_tick
+        self.state.acceleration_unit = self._acceleration_unit
         memory.watch_items(("drive_mode", "homing_offset", "operating_mode"), self._orient)
         memory.watch_items(("moving_threshold",), self._set_threshold)
         self.show_items()
@@ -108,6 +106,7 @@ class ModeShaft(Shaft):
         if ignored and self.memory.get("operating_mode") == OperatingMode.POSITION:
             self._offset = 0
         self.state.sign, self.state.offset = self._sign, self._offset
+        self.state.time_based = bool(self.memory.get("drive_mode") & TIME_BASED)
 
     def _set_threshold(self) -> None:
         threshold = self.memory.get("moving_threshold", 1)
@@ -176,44 +175,8 @@ class ModeShaft(Shaft):
         whole = self.motor.stall_torque if parts else self.motor.torque_per_ampere
         return self._torque_item.scale * whole
 
-    def _new_trajectory(self, *, afresh: bool = False) -> Trajectory | None:
-        memory, table = self.memory, self.memory.table
-        velocity, ramp = self._profile(self._speed_item), self._profile(self._ramp_item)
-        aimed = (memory["goal_position"], velocity, ramp)
-        if aimed == self._aimed and not afresh:
-            return None
-        self._aimed = aimed
-        goal = self._sign * (memory.ticks("goal_position") - self._offset) * table.rad_per_tick
-        if not velocity:
-            self.state.profile_kind = 0
-            return goal, FREE, FREE
-        distance = abs(goal - self.mechanics.servos["setpoint"].item(self.index))
-        if memory.get("drive_mode") & TIME_BASED:
-            return self._timed(goal, distance, velocity * 1e-3, ramp * 1e-3)
-        speed = velocity * table.rad_s_per_tick
-        acceleration = ramp * self._acceleration_unit or FREE
-        self.state.profile_kind = _kind(ramp, distance, speed, acceleration)
-        return goal, speed, acceleration
-
-    def _timed(self, goal: float, distance: float, duration: float, ramp: float) -> Trajectory:
-        """Return the trajectory of a move with a duration and an acceleration time, s; the latter is at
-        most half as long."""
-        if distance == 0.0:
-            return goal, FREE, FREE
-        ramp = min(ramp, duration / 2)
-        speed = distance / (duration - ramp)
-        acceleration = speed / ramp if ramp else FREE
-        self.state.profile_kind = _kind(ramp, distance, speed, acceleration)
-        return goal, speed, acceleration
-
     def _profile(self, name: str) -> int:
         return abs(self.memory.ticks(name)) if name in self.memory else 0
-
-
-def _kind(ramp: float, distance: float, speed: float, acceleration: float) -> int:
-    if not ramp:
-        return _RECTANGULAR
-    return _TRAPEZOIDAL if distance * acceleration > speed * speed else _TRIANGULAR
 
 
 def _position_gains(memory: Memory, motor: Motor) -> ServoCommand:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import ctypes
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from typing import ClassVar, NamedTuple
 
@@ -18,8 +18,7 @@ from dxlsim.registers.access import ShaftItems
 from dxlsim.registers.memory import Memory, value_range
 from dxlsim.simulation_plan import Load
 
-Trajectory = tuple[float, float, float]
-"""Goal of a move, rad of the shaft, and the profile's speed, rad/s, and acceleration, rad/s^2."""
+_ENCODINGS = {"unsigned": 0, "twos_complement": 1, "sign_magnitude": 2}  # As in mechanics.c
 
 
 class LiveItem(NamedTuple):
@@ -63,7 +62,6 @@ class Shaft(ABC):
         self.address = ctypes.addressof(self.state)
         self._last: ServoCommand | None = None
         self._goes_to_goal = False
-        self.response_delay_ns = 0  # Delay until a command takes effect; torque off has none
         self._withdrawn = 0  # Number of times that pending commands were withdrawn
 
     @property
@@ -154,10 +152,32 @@ class Shaft(ABC):
         self._forget()
 
     def _forget(self) -> None:
-        self._withdrawn += 1
+        self._withdraw()
         self._last = None
         self._goes_to_goal = False
         self.state.turns = False
+
+    def _withdraw(self) -> None:
+        self._withdrawn += 1
+        self.mechanics.withdraw(self.index)
+
+    @property
+    def response_delay_ns(self) -> int:
+        """Delay until a command takes effect, ns; torque off has none."""
+        delay_ns: int = self.state.response_delay_ns
+        return delay_ns
+
+    @response_delay_ns.setter
+    def response_delay_ns(self, delay_ns: int) -> None:
+        self.state.response_delay_ns = delay_ns
+
+    def take_goal_items(self, names: Sequence[str]) -> None:
+        """Set the items of a goal: position, speed and acceleration; names that the model lacks are
+        ignored."""
+        for struct, name in zip(self.state.goal_items, names, strict=True):
+            if (item := self.memory.table.items.get(name)) is not None:
+                struct.address, struct.size = item.address, item.size
+                struct.encoding = _ENCODINGS[item.encoding]
 
     def advance_to(self, now_ns: int) -> None:
         """Advance the shaft's time and the mechanics to `now_ns`; an earlier time is ignored."""
@@ -172,19 +192,20 @@ class Shaft(ABC):
         if self.items.aims.isdisjoint(written) and self.items.others.isdisjoint(written):
             return
         if self._goes_to_goal and self.items.aims.issuperset(written):
-            if (trajectory := self._new_trajectory()) is not None:
-                self._act(partial(self.mechanics.aim, self.index, *trajectory))
+            if self._library.motion_plan(self.address, 0):
+                self.mechanics.follow_plan(self.address)
             return
         command = self._command() if self.torque_on else LIMP
         self._goes_to_goal = command.limit > 0.0 and self._controls_position
-        if self._goes_to_goal and (trajectory := self._new_trajectory(afresh=True)) is not None:
-            goal, speed, acceleration = trajectory
+        if self._goes_to_goal:
+            self._library.motion_plan(self.address, 1)
+            goal, speed, acceleration = self.state.next
             command = command._replace(goal=goal, speed=speed, acceleration=acceleration)
         if command != self._last:
             self._last = command
             self.state.turns = command.turning != 0.0
             if command.limit == 0.0:
-                self._withdrawn += 1
+                self._withdraw()
                 self.mechanics.command_servo(self.index, command)
             else:
                 self._act(partial(self.mechanics.command_servo, self.index, command))
@@ -224,11 +245,6 @@ class Shaft(ABC):
     @property
     @abstractmethod
     def _controls_position(self) -> bool: ...
-
-    @abstractmethod
-    def _new_trajectory(self, *, afresh: bool = False) -> Trajectory | None:
-        """Return the trajectory that the registers ask for, or None if it has not changed; `afresh`:
-        return it in any case."""
 
 
 def critical_d(p: float, motor: Motor) -> float:

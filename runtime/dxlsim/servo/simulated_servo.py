@@ -42,7 +42,7 @@ class SimulatedServo(SimulatedNode):
         Enable to 1 [i]."""
         self.boot_ns = BOOT_NS
         """Duration of a reboot or a factory reset by an instruction of Protocol 2.0, ns."""
-        self.write_time_ns = 0  # Time without reception after an instruction that writes
+        self._write_time_ns = 0
         self._registered: tuple[int, bytes] | None = None
         super().__init__(memory, error_of, note, shaft.now_ns)
         memory.show_range = shaft.show_range
@@ -59,8 +59,26 @@ class SimulatedServo(SimulatedNode):
             *(GoalState(address=item.address, size=item.size, is_signed=item.signed) for item in self._goals)
         )
         self._names_of: dict[int, frozenset[str]] = {}
+        self.line.take_goal = function_address("take_goal")
+        self._set_aims()
         self.line.goals, self.line.goal_count = ctypes.addressof(self._accepted), len(self._goals)
         memory.watch_items(RULES, self._accept_goals)
+
+    @property
+    def write_time_ns(self) -> int:
+        """Time without reception after an instruction that writes, ns."""
+        return self._write_time_ns
+
+    @write_time_ns.setter
+    def write_time_ns(self, duration_ns: int) -> None:
+        self._write_time_ns = duration_ns
+        self._set_aims()
+
+    def _set_aims(self) -> None:
+        """Let the line follow goals that only change a trajectory, unless a write takes time."""
+        aims = self.shaft.items.aims
+        bits = sum(1 << index for index, item in enumerate(self._goals) if item.name in aims)
+        self.line.aims = 0 if self._write_time_ns else bits
 
     def _identify(self) -> None:
         super()._identify()

@@ -94,6 +94,9 @@ typedef struct { /* one servo or device, as the line sees it */
     int32_t goal_count;
     const Goal *goals;
     void (*show)(void *shaft, int64_t now_ns, int32_t address, int32_t length); /* writes the motion into `memory`: */
+    /* Follows goals that only change a trajectory: motion_take_goal of mechanics.c; returns 0: Python follows them */
+    int32_t (*take_goal)(void *shaft, int64_t now_ns);
+    int64_t aims;          /* bits of these goals; 0: Python follows all goals */
     void *shaft;           /* motion_show of mechanics.c; NULL: Python sets registers before they are read */
 } Node;
 
@@ -1311,7 +1314,7 @@ static void execute_for(Bus *b, int32_t index, const Packet *p, int64_t end_ns)
         int32_t listed;
         const uint8_t *data = listed_data(b->line.protocol, p, n, &place, &listed);
         int64_t written = data ? write_goals(n, &place, data) : 0;
-        if (written)
+        if (written && ((written & ~n->aims) || !n->take_goal(n->shaft, end_ns)))
             b->line.call(WRITTEN, index, written);
         if (written || !listed)
             return;
