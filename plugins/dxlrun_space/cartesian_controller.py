@@ -35,7 +35,7 @@ from dxlrun import (
     RobotModel,
 )
 from dxlrun.tooling.robots import FrameTree, Urdf, read_urdf
-from dxlrun_space.chain import IDENTITY, Chain, Pose, Rotation, Vector, WrongChain, rotation_of
+from dxlrun_space.chain import BASE, IDENTITY, Chain, Pose, Rotation, Vector, WrongChain, rotation_of
 from dxlrun_space.path import (
     MotionLimits,
     NoPath,
@@ -46,7 +46,7 @@ from dxlrun_space.path import (
     plan_line,
     shifted,
 )
-from dxlrun_space.solver import Solution, Solver, distance, residual_of
+from dxlrun_space.solver import FULL, Solution, Solver, distance, residual_of
 from dxlrun_space.space_goals import (
     PoseCommand,
     PoseGoal,
@@ -63,8 +63,6 @@ ACCELERATION: Final = 20.0
 """Acceleration of joints without a limit, rad/s^2; an XM430 stops from its highest speed in 0.25 s."""
 SPEED: Final = 4.0
 """Speed of joints without a limit, rad/s: less than the slowest arm servo's at 12 V."""
-FULL: Final = 6
-"""Number of joints that can follow every orientation."""
 STEP_NS: Final = 500_000
 """Period that pays for one step of planning: a step takes 0.06 ms, so planning takes 12 % of a cycle."""
 MOST_STEPS: Final = 50
@@ -74,7 +72,6 @@ FEEDBACK_NS: Final = 100_000_000
 LEASH_M: Final = 0.02
 """Longest distance of the pose that moves toward a leader from what is in reach, m: the way back is short."""
 _LONGEST_STOP_S: Final = 2.0
-_BASE: Final[Pose] = (IDENTITY, (0.0, 0.0, 0.0))
 _ZERO: Final[Vector] = (0.0, 0.0, 0.0)
 
 
@@ -272,7 +269,7 @@ class CartesianController(Controller[CartesianParameters]):
         self._ending: Outcome | None = None
         """Outcome of the goal once the tip rests; None: another goal begins then."""
         self._asked: PoseGoal | None = None
-        self._target: Pose = _BASE
+        self._target: Pose = BASE
         self._planning: Planning | None = None
         self._path: Path | None = None
         self._passed_s = self._rate = self._slope = 0.0
@@ -407,7 +404,7 @@ class CartesianController(Controller[CartesianParameters]):
     def _pose_of(self, frame: str) -> Pose | str:
         """Return the pose of a frame in the base, or why it is not known."""
         if not frame:
-            return _BASE
+            return BASE
         positions = dict(zip(self.context.joints, self._at, strict=False))
         for name, value in zip(self.context.read_names, self.context.reads.tolist(), strict=True):
             positions[name.removesuffix("/position")] = value

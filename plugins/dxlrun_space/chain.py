@@ -23,6 +23,8 @@ Column: TypeAlias = "tuple[float, float, float, float, float, float]"
 """Velocity of the link by one joint at unit speed: linear, then angular, in the axes of the base."""
 
 IDENTITY: Final[Rotation] = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+BASE: Final[Pose] = (IDENTITY, (0.0, 0.0, 0.0))
+"""Pose of the base in itself."""
 _LEAST_SINE: Final = 1e-9
 
 

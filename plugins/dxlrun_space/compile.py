@@ -9,16 +9,13 @@ from pydantic import ValidationError
 
 from dxlrun.tooling.features import Compilation, CompileStage, Contribution, Row
 from dxlrun_space import form
-from dxlrun_space.chain import IDENTITY, Chain, Pose, WrongChain
+from dxlrun_space.chain import BASE, Chain, WrongChain
 from dxlrun_space.path import out_of_reach, suffices
 from dxlrun_space.reach import dexterity
-from dxlrun_space.solver import Search, Solution, Solver
+from dxlrun_space.solver import FULL, Search, Solution, Solver
 from dxlrun_space.space_goals import PoseCommand, flat_pose, read_pose
 
 _GOAL: Final = {"x", "y", "z", "rpy", "quaternion"}
-_BASE: Final[Pose] = (IDENTITY, (0.0, 0.0, 0.0))
-_FULL: Final = 6
-"""Number of joints that can have every orientation."""
 
 
 def compile_tip_poses(compilation: Compilation) -> Contribution:
@@ -59,8 +56,8 @@ def _solved(compilation: Compilation, pose: form.TipPose) -> Row | None:
     except ValidationError as error:
         what, _, fix = error.errors()[0]["msg"].removeprefix("Value error, ").partition("; ")
         raise WrongChain("", what, fix or "remove the others") from None
-    exact = goal.asks_orientation and len(plans) >= _FULL
-    target = goal.target(_BASE, chain.pose(start))
+    exact = goal.asks_orientation and len(plans) >= FULL
+    target = goal.target(BASE, chain.pose(start))
     search = (
         solver.search(target, start, exact=exact)
         if goal.asks_orientation

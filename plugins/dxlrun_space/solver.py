@@ -49,8 +49,8 @@ _STILL: Final = 1e-7
 """Change of all joints below which a search has converged, rad or m."""
 _DAMPING: Final = (1e-3, 1e-7, 1e-12, 1e3)
 """First damping, that of a start near the solution, smallest, and largest: parts of the squared length."""
-_POSE: Final = 6
-"""Degrees of freedom of a pose. Joints in addition leave a choice."""
+FULL: Final = 6
+"""Degrees of freedom of a pose. Fewer joints lack orientations, and more leave a choice."""
 _PRIMES: Final = (2, 3, 5, 7, 11, 13, 17, 19, 23)
 
 
@@ -116,7 +116,7 @@ class Solver:
         self.chain = chain
         self.lower, self.upper = tuple(lower), tuple(upper)
         self._posture = tuple(posture) or (None,) * len(chain.joints)
-        self._redundant = len(chain.joints) > _POSE and any(each is not None for each in self._posture)
+        self._redundant = len(chain.joints) > FULL and any(each is not None for each in self._posture)
         self._tendency = (_POSTURE * chain.length) ** 2
         self._unlimited = (-math.inf,) * len(self.lower), (math.inf,) * len(self.upper)
         self._samples = [self._spread(number) for number in range(SAMPLES)]
