@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from msgspec.structs import force_setattr
-from tests.kit.line_faults import truncate_next
+from tests.kit.line_faults import truncate_next, watch_instructions
 from tests.kit.sampled_run import SampledRun, changes_of
 from tests.kit.stories import ask, rate, send, switch
 from tests.kit.wire import all_writes
@@ -20,6 +20,7 @@ from tests.kit.wire import all_writes
 from dxlrun.channels.answers import Code, Refusal
 from dxlrun.errors import StartUpError
 from dxlrun.plan.policy_plan import SLOW_SPEED
+from dxlsim.wire.servo_packets import Instruction, InstructionPacket
 
 ROBOT = """\
 name: three
@@ -316,14 +317,15 @@ def test_a_start_restores_a_torque_limit_that_is_lowered(built, policies):
 def test_a_start_ends_when_a_servo_may_be_left_weak(built):
     run = built(0.1, on_fault=STEPS["less torque"])
     run.servos["tilt"].poke("torque_limit", 307)
-    receive = run.bus.receive_bytes
 
-    def heard(data, at_ns):
-        if data[2] == 7 and data[4:-1] == b"\x02\x22\x02":
+    def lose_limit(packet: InstructionPacket, _: int) -> None:
+        if packet.servo_id == 7 and (packet.instruction, packet.parameters) == (
+            Instruction.READ,
+            b"\x22\x02",
+        ):
             truncate_next(run.bus, 7, 0)
-        receive(data, at_ns)
 
-    run.bus.receive_bytes = heard
+    watch_instructions(run.bus, lose_limit)
     said = "tilt (ID 7 on bus main) did not answer when its torque limit was read"
     with pytest.raises(StartUpError, match=re.escape(said)):
         run.robot.run()
