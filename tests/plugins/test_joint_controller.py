@@ -228,9 +228,10 @@ class Lean(JointController):
 
 
 class Quick(Lean):
-    """With a speed, and one field more."""
+    """With a speed, and two fields more."""
 
     speed: float = 2.0
+    far: float = reading("ankle/position")
 
     def velocities(self, time: float, dt: float) -> Floats:
         return np.full(2, self.speed * dt)
@@ -254,7 +255,7 @@ def test_what_it_is_sent_in_its_first_cycle_is_not_lost() -> None:
 
 def test_it_begins_when_all_that_it_reads_is_known_and_time_counts_from_there() -> None:
     stage = Stage(Quick, {"joints": ["a", "b"], "other": "hip/position"}).activate()
-    assert stage.interfaces.reads == ("hip/position",)
+    assert stage.interfaces.reads == ("hip/position", "ankle/position")
     assert stage.interfaces.command == ("position", "velocity")
     assert np.isnan(stage.update(1.0, follow=False)).all()
     stage.context.reads[:] = 0.5
@@ -273,7 +274,8 @@ def test_it_waits_for_a_joint_that_was_not_heard_yet() -> None:
     stage = Stage(Hold, {"joints": ["a", "b"]}, present=(0.3, np.nan)).activate()
     assert np.isnan(stage.update(0.0, follow=False)).all()
     stage.states.position[1] = 0.7
-    assert stage.update(0.1, follow=False).tolist() == [0.3, 0.7]
+    stage.sent.position[:] = 0.25, np.nan  # the joint sags below its goal
+    assert stage.update(0.1, follow=False).tolist() == [0.25, 0.7]
 
 
 def test_names_of_the_entry_are_no_fields_and_the_class_fits_the_contract() -> None:

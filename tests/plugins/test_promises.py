@@ -6,6 +6,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
+from tests.kit.campaigns import campaign
 from tests.kit.laws import CONTROLLERS, Case, Story, cases
 
 PHYSICS = pytest.mark.needs("physics")
@@ -31,16 +32,16 @@ def test_its_parameters_survive_the_plan_and_an_unknown_key_is_refused(case: Cas
 
 
 @EACH
-@pytest.mark.parametrize("seed", range(3))
-def test_what_was_commanded_once_stays_a_finite_number(case: Case, seed: int) -> None:
+@campaign(ci=2, night=20, release=200)
+def test_what_was_commanded_once_stays_a_finite_number(case: Case, number: int) -> None:
     """The contract: infinity, and NaN behind a number, are its faults, and end it."""
     stage = case.stage()
-    if seed == 0:  # nothing was heard of any joint yet
+    if number == 0:  # nothing was heard of any joint yet
         stage.states.motion[:] = stage.sent.values[:] = np.nan
         stage.states.valid[:] = False
     stage.activate()
     known = np.zeros(stage.commands.values.size + stage.context.device_commands.size, dtype=bool)
-    for commanded in Story(stage, case, seed).cycles(300):
+    for commanded in Story(stage, case, number).cycles(300):
         assert not np.isinf(commanded).any()
         assert np.isfinite(commanded[known]).all()
         known |= np.isfinite(commanded)
@@ -54,13 +55,13 @@ def test_the_same_story_gives_the_same_commands_to_the_bit(case: Case) -> None:
 
 
 @EACH
-@pytest.mark.parametrize("seed", range(6))
-def test_activated_again_it_does_what_a_new_one_does(case: Case, seed: int) -> None:
+@campaign(ci=2, night=20, release=200)
+def test_activated_again_it_does_what_a_new_one_does(case: Case, number: int) -> None:
     old = case.stage().activate()
-    story = Story(old, case, seed)
+    story = Story(old, case, number)
     for _ in story.cycles(120):
         pass
-    if seed % 2:  # one that a fault ended is not called
+    if number % 2:  # one that a fault ended is not called
         old.controller.on_deactivate(old.time_ns)
     story.end_goal()
     old.controller.parameters = old.model

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from tests.remote.conftest import plugins
 
-from dxlrun.cli.steering.joints import source_facts
+from dxlrun.cli.steering.joints import facts, source_facts
 from dxlrun.messages.cdr import Codec
 from dxlrun.messages.definition import MessageType
 from dxlrun.remote.live.states import RobotStates, array
@@ -52,6 +52,18 @@ def test_what_is_commanded_of_a_device_is_asked_for_by_name(board):
     assert ("led, commanded", "1") in source_facts(answer)
     hint = board.ask("GET", "/joints/board/register_9")[1]["refused"]
     assert "board/register_7" in hint
+
+
+def test_effort_and_its_goal_are_two_facts():
+    names = "position velocity goal_position goal_velocity goal_pwm temperature voltage hardware_error age"
+    state = dict.fromkeys(names.split()) | {
+        "unit": "rad",
+        "effort_unit": "A",
+        "torque": "on",
+        "mode": "effort",
+    }
+    found = facts(state | {"effort": 0.1, "goal_effort": 0.25})
+    assert found[:2] == [("effort", "0.100 A"), ("goal effort", "0.250 A")]
 
 
 def test_states_of_a_device_are_asked_for_by_name_and_listened_to(board):

@@ -160,14 +160,14 @@ def log_with_include(robot_file: Path, tmp_path: Path) -> Path:
     robot.parent.mkdir()
     robot.write_text(f"include: [../controllers.yaml]\n{head}")
     controllers.write_text(f"controllers:\n{tail}")
-    simulated_robot(robot, duration_s=0.5, log=log).run()
+    simulated_robot(robot, arguments={"rate": "100"}, duration_s=0.5, log=log).run()
     controllers.unlink()
     robot.unlink()
     return log
 
 
 def test_included_files_and_the_urdf_come_from_the_log(log_with_include: Path, tmp_path: Path) -> None:
-    assert replay_log(log_with_include, (), {"speed": "5 rad/s"}).compared == 25
+    assert replay_log(log_with_include, (), {"speed": "5 rad/s"}).compared == 50
     torso = tmp_path / "torso.mcap"
     simulated_robot(ROBOTS / "bioloid_torso.yaml", duration_s=0.2, log=torso).run()
     assert replay_log(torso, (), {"rate": "50"}).same
