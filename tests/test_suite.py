@@ -268,10 +268,15 @@ def test_each_fragment_of_the_changelog_is_one_that_towncrier_takes() -> None:
     assert config["start_string"] in (ROOT / config["filename"]).read_text()
 
 
-def test_wheel_has_every_robot_and_motion(built: Path) -> None:
+def test_wheel_has_every_object_robot_and_motion(built: Path) -> None:
     """For `dxlrun examples`; the top level of the repository stays their only source."""
     (wheel,) = built.glob("*.whl")
     with zipfile.ZipFile(wheel) as archive:
+        compiled = {
+            one.filename for one in archive.filelist if one.filename.endswith(".so") and one.file_size
+        }
+        sources = (path.relative_to(ROOT / "runtime") for path in (ROOT / "runtime").rglob("*.c"))
+        assert compiled == {str(one.with_name(f"lib{one.stem}.so")) for one in sources}
         names = [name for name in archive.namelist() if name.startswith("dxlrun/examples/")]
         shipped = {Path(name).relative_to("dxlrun/examples"): archive.read(name) for name in names}
     tracked = [

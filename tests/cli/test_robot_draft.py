@@ -39,7 +39,7 @@ def test_every_model_gets_a_line_that_check_accepts(tmp_path: Path, protocol: fl
 def test_file_has_what_was_found(tmp_path: Path) -> None:
     path = tmp_path / "My-Arm 2.yaml"
     servos = [
-        found(1, "XM430-W350", lowest=1001, highest=3001, return_delay=0),
+        found(1, "XM430-W350", lowest=1000, highest=3001, return_delay=0),
         found(7, "XL430-W250", lowest=0, highest=4095, return_delay=20_000, remarks=("is tired",)),
     ]
     text = draft_file(path, PORT, servos, 4_000_000)
@@ -48,7 +48,7 @@ def test_file_has_what_was_found(tmp_path: Path) -> None:
     (bus,) = plan.buses
     assert (plan.robot, bus.port, bus.baud_rate, bus.latency_ns) == ("my_arm_2", PORT, 1_000_000, 4_000_000)
     assert bus.return_delay_ns == 20_000
-    assert 1001 <= bus.servos[0].lower_tick <= 1003
+    assert 1000 <= bus.servos[0].lower_tick <= 1002
     assert 2999 <= bus.servos[0].upper_tick <= 3001
     assert "# joint_7: is tired" in text
     assert "continuous: true" in draft("base", PORT, [found(1, "AX-12A", 1.0, lowest=0, highest=0)], 0)

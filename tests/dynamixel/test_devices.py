@@ -208,16 +208,16 @@ def test_a_number_that_is_none_is_not_believed():
 
 
 def test_a_command_is_written_when_it_changes_and_now_and_then_and_ends_safe():
-    rig = started(("speed",), commands=("led", "pwm"))
+    rig = started(("speed",), commands=("pwm", "led"))
 
     def writes():
         return [packet[8:-2] for packet in rig.into_bus() if packet[4] == 101 and packet[7] == 0x03]
 
     rig.cycles(60)
     assert writes() == []  # NaN: as it is
-    rig.device_commands[:] = 1.0, -885.0
+    rig.device_commands[:] = -885.0, 1.0
     rig.cycles(20)
-    assert writes() == [b"\x41\0\x01", b"\x64\0" + struct.pack("<h", -885)]
+    assert writes() == [b"\x64\0" + struct.pack("<h", -885), b"\x41\0\x01"]
     rig.cycles(40)
     assert len(writes()) == 4
     device(rig).cut_power(rig.clock.now_ns() + 30_000_000)

@@ -348,20 +348,3 @@ def test_a_build_without_any_compiler_fails_and_names_the_fix(build, tmp_path, m
     hook = build.KernelHook(str(tmp_path), {}, None, None, "", "wheel")
     with pytest.raises(RuntimeError, match=r"install a C compiler \(sudo apt install gcc\)"):
         hook.initialize("standard", {})
-
-
-def test_a_wheel_has_every_object_that_is_compiled(build, tmp_path):
-    hook, data = build.KernelHook(str(tmp_path), {}, None, None, "", "wheel"), {"force_include": {}}
-    hook.initialize("standard", data)
-    rooms = (
-        "dxlwire/exchange/libkernel.so",
-        "dxlrun/control/libgate.so",
-        "dxlsim/wire/libline.so",
-        "dxlrun/contract/libpolynomial.so",
-        "dxlrun/channels/libshared_memory.so",
-        "dxlsim/motion/libmechanics.so",
-    )
-    assert tuple(data["force_include"].values()) == rooms
-    assert all(Path(made).stat().st_size for made in data["force_include"])
-    hook.finalize("standard", data, "")
-    assert not any(Path(made).exists() for made in data["force_include"])

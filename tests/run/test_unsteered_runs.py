@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 from pathlib import Path
 
 import pytest
@@ -49,23 +48,16 @@ def pan_goals(running: Running) -> list[int]:
 def test_stop_leaves_a_run_that_is_already_ending_its_pose(
     dxlrun: Dxlrun, start: Start, tmp_path: Path
 ) -> None:
-    runs = {name: start(robot=robot_file(tmp_path, name, POSE)) for name in ("bare_arm", "bare_leg")}
-    for running in runs.values():
-        running.wait_until_moving()
-    listed = dxlrun("list").err
-    for name in runs:
-        assert f"dxlrun: {name} {NO_GATEWAY}; end it by `dxlrun stop --robot {name}`\n" in listed
-    for name, running in runs.items():
-        if name == "bare_arm":
-            running.signal(signal.SIGINT)
-        else:
-            assert dxlrun("stop", "--no-wait").out.startswith(f"{name} is ending")
-        until(lambda running=running: max(pan_goals(running)) > 512 + 20, "the way to the pose")
-        assert dxlrun("stop", "--robot", name).out.startswith(f"{name} has ended")
-        _, out, err = running.finish()
-        assert "cut" not in out + err
-        assert abs(pan_goals(running)[-1] - RAISED) <= 2
-        assert running.is_limp()
+    running = start(robot=robot_file(tmp_path, "bare_arm", POSE))
+    running.wait_until_moving()
+    assert dxlrun("list").err == f"dxlrun: bare_arm {NO_GATEWAY}; end it by `dxlrun stop --robot bare_arm`\n"
+    assert dxlrun("stop", "--no-wait").out.startswith("bare_arm is ending")
+    until(lambda: max(pan_goals(running)) > 512 + 20, "the way to the pose")
+    assert dxlrun("stop").out.startswith("bare_arm has ended")
+    _, out, err = running.finish()
+    assert "cut" not in out + err
+    assert abs(pan_goals(running)[-1] - RAISED) <= 2
+    assert running.is_limp()
 
 
 @pytest.mark.timeout(300)  # several runs
