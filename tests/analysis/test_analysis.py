@@ -12,6 +12,7 @@ from rich.console import Console
 from tests.kit.made_logs import Cycle, Said, Wire
 
 from dxlrun.channels.event_records import EventCode, Severity
+from dxlrun.log import log_reader, log_writer
 from dxlrun.output.terminal import show_parts
 from dxlrun.output.text_table import Table, microseconds
 from dxlrun_analysis.parts.cycles import CONTROLLERS, STEPS
@@ -131,7 +132,10 @@ def test_periods_that_vanished_are_reported(write: Write, numbers: list[tuple[in
 @pytest.mark.parametrize(
     ("cycles", "told"),
     [
-        ([Cycle(0), Cycle(1, read=23_000)], "; a cycle took up to 23.40 ms, its read 23.00 ms: own work."),
+        (
+            [Cycle(0), Cycle(1, read=23_000), Cycle(3, read=21_000, skipped=1)],
+            "; a cycle took up to 23.40 ms, its read 23.00 ms: own work.",
+        ),
         (
             [Cycle(number, late=200 if number < 3 else 10) for number in range(100)],
             "worst wake-up 200 us late, 3.0% later than 150 us.",
@@ -139,7 +143,12 @@ def test_periods_that_vanished_are_reported(write: Write, numbers: list[tuple[in
     ],
     ids=["a long cycle", "rough wake-ups"],
 )
-def test_long_cycle_and_rough_wake_ups_are_reported(write: Write, cycles: list[Cycle], told: str) -> None:
+def test_long_cycle_and_rough_wake_ups_are_reported(
+    write: Write, monkeypatch: pytest.MonkeyPatch, cycles: list[Cycle], told: str
+) -> None:
+    """In whichever slice of the log they are."""
+    monkeypatch.setattr(log_writer, "CHUNK_BYTES", 64)
+    monkeypatch.setattr(log_reader, "SLICE_BYTES", 1)
     assert told in analyze_log(write(cycles)).verdict.sentences[1]
 
 

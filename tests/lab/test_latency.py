@@ -12,6 +12,7 @@ from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from statistics import mean, stdev
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -28,7 +29,7 @@ from dxlrun_analysis.latency import latency_log, latency_tables
 from dxlrun_analysis.latency.conditions import Condition, Settings, conditions, order
 from dxlrun_analysis.latency.latency_page import page
 from dxlrun_analysis.latency.statistics import Block, figures, interval, mode_us, t_quantile
-from dxlrun_lab.latency import wake_ups
+from dxlrun_lab.latency import latency_measurement, wake_ups
 from dxlrun_lab.latency.buffer import Buffer, BufferOffset
 from dxlrun_lab.latency.latency_measurement import compiled_yardstick
 from dxlrun_lab.latency.wake_ups import measure_wake_ups
@@ -201,6 +202,17 @@ def test_the_order_of_the_blocks_is_counterbalanced(number):
     if number <= 3:
         pairs = Counter(pair for one in rounds for pair in itertools.pairwise(one))
         assert all(pairs[first, second] == pairs[second, first] for first, second in pairs)
+
+
+def test_a_measurement_alternates_its_conditions(monkeypatch):
+    asked = []
+    process = MagicMock()
+    monkeypatch.setattr(
+        latency_measurement, "_Process", lambda _, condition, *__: asked.append(condition) or process
+    )
+    found = settings(OTHER, FIFO, blocks=2)
+    latency_measurement.measure_blocks(found, "", MagicMock(), MagicMock(), MagicMock())
+    assert asked == [OTHER, FIFO, FIFO, OTHER]
 
 
 # Statistics
