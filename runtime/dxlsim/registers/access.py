@@ -187,6 +187,8 @@ def _angle_limits(memory: Memory, item: ControlItem) -> Bounds:
 
 def accepted_goals(memory: Memory, item: ControlItem) -> Bounds:
     """Return the values of a goal that a servo accepts now without an error, all or some of them."""
+    if item.area == "EEPROM":  # Y, Profile Velocity: torque locks it
+        return NOTHING
     if memory.table.protocol == 2.0:
         ranges = _range_of(memory, item), _limits_of(memory, item)
     elif multi_turn_mode(memory) or item.name == "goal_torque":
