@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import ctypes
+import signal
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -93,6 +96,25 @@ def test_who_talks_into_a_reply_loses_both(split, received):
     bus.receive_bytes(READ_1, 600_000)
     assert early + bus.drain_bytes(LATER) == bytes.fromhex(received)
     assert "the host sends during" in notes(bus)
+
+
+@pytest.mark.parametrize("baud_rate", [1 << 31, (1 << 32) - 1])
+def test_any_rate_of_a_terminal_is_one_at_which_a_host_talks_into_a_reply(baud_rate):
+    bus = new_bus()
+    bus.receive_bytes(READ_1, 0)
+    bus.drain_bytes(600_000)
+    bus.baud_rate = baud_rate
+    bus.receive_bytes(READ_1, 600_000)
+    assert bus.baud_rate == baud_rate
+    assert bus.drain_bytes(LATER)[:2] == PONG_1[:2]
+
+
+@pytest.mark.filterwarnings("ignore:Exception ignored on calling ctypes")
+def test_an_interrupt_before_a_task_of_the_line_begins_is_not_lost():
+    bus, library = new_bus(), ctypes.CDLL(None)
+    bus._line.step, bus._line.mechanics = ctypes.cast(library["raise"], ctypes.c_void_p), signal.SIGINT
+    with pytest.raises(KeyboardInterrupt):
+        bus.receive_bytes(PING_1, 0)
 
 
 def test_a_host_that_sends_within_the_return_delay_is_received():

@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from dxlsim.bus.ledger import FLUSH_NS, Ledger, LedgerEntry, read_ledger
-from dxlwire.exceptions import InputError
+from dxlsim.wire import compiled_line
+from dxlwire.exceptions import InputError, NotCompiled
 
 ENTRIES = (
     LedgerEntry(5, "main", "in", b"\xff\xff\x01", ""),
@@ -93,3 +94,12 @@ def test_a_full_disk_is_reported(more):
     assert ("No space left" in str(ledger.error)) == bool(more)
     ledger.close()
     assert "No space left" in str(ledger.error)
+
+
+def test_without_the_compiled_line_it_fails_at_once_and_not_at_its_end(monkeypatch):
+    def missing() -> None:
+        raise NotCompiled("missing")
+
+    monkeypatch.setattr(compiled_line, "line_library", missing)
+    with pytest.raises(NotCompiled):
+        Ledger()

@@ -356,16 +356,16 @@ class SimulatedBus:
         """Raise the exception of a task, if any."""
         if self._line.raised:
             raised, self._raised, self._line.raised = self._raised, None, 0
-            raise raised or AssertionError
+            raise raised or KeyboardInterrupt  # Python prints an exception that came before `_do` had begun
 
     def _do(self, task: int, first: int, second: int) -> int:
-        if self._line.raised:
-            return 0
         try:
-            return int(self._tasks[task](first, second) or 0)
+            return 0 if self._line.raised else int(self._tasks[task](first, second) or 0)
         except BaseException as error:
             self._raised, self._line.raised = error, 1
             return 0
+        finally:
+            self._line.done = 1
 
     def _list_tasks(self) -> list[Callable[[int, int], int | None]]:
         tasks: dict[Task, Callable[[int, int], int | None]] = {

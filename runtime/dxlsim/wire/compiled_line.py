@@ -157,19 +157,21 @@ def line_function(name: str) -> Callable[..., int]:
 def new_line(protocol: float, start_ns: int, owner: object) -> tuple[int, ctypes.Structure]:
     """Return the address of a new line, which lives as long as its owner, and its state."""
     address = line_function("new")(int(protocol), start_ns)
-    finalize(owner, line_function("free"), address)
+    _free_with(owner, "free", address)
     return address, LineState.from_address(address)
 
 
 def new_ledger(owner: object) -> ctypes.Structure:
     """Return the state of a new ledger, whose entries live as long as its owner."""
     state = LedgerState()
-    finalize(owner, _free_ledger, state)
+    _free_with(owner, "free_ledger", byref(state))
     return state
 
 
-def _free_ledger(state: ctypes.Structure) -> None:
-    line_function("free_ledger")(byref(state))
+def _free_with(owner: object, name: str, memory: object) -> None:
+    """Free memory by a function of the library as soon as its owner is gone. At the exit of the interpreter it
+    stays: the thread of a served bus may still use it."""
+    finalize(owner, line_function(name), memory).atexit = False
 
 
 def packet_of(state: ctypes.Structure) -> InstructionPacket:
@@ -187,7 +189,7 @@ class InstructionReceiver:
         self._address = line_function("receiver")(int(protocol))
         self._state = _Receiver.from_address(self._address)
         self._found = _Packet()
-        finalize(self, line_function("free_receiver"), self._address)
+        _free_with(self, "free_receiver", self._address)
 
     @property
     def pending(self) -> int:

@@ -152,8 +152,8 @@ typedef struct {
     int64_t planned_after; /* number of packets after which the next one runs; NEVER: none */
     int32_t (*step)(void *mechanics, int64_t now_ns); /* motion_step_to of mechanics.c; not 0: Python continues */
     void *mechanics;
-    int64_t timer_ns, delivered;
-    int32_t node_count, protocol, baud_rate, bus;
+    int64_t timer_ns, delivered, baud_rate;
+    int32_t node_count, protocol, bus, done; /* `done`: set by Python at the end of a task */
     int32_t plugged, unplugged; /* `unplugged`: number of times */
     int32_t wedged, echo, slots, recorded, altered, waits;
     int32_t split; /* adapter: 0: whole replies, 1: single bytes, 2: random pieces */
@@ -454,6 +454,15 @@ int32_t line_read(int32_t protocol, const uint8_t *d, int32_t size, Entry *entry
     return 1;
 }
 
+/* Run a task of Python. A signal may raise an exception before Python's function has begun, which could not store it. */
+static int64_t run_task(Bus *b, int32_t task, int64_t first, int64_t second)
+{
+    b->line.done = 0;
+    int64_t result = b->line.call(task, first, second);
+    b->line.raised |= !b->line.done;
+    return result;
+}
+
 /* Notes and ledger */
 
 static void note(Bus *b, const char *format, ...)
@@ -464,7 +473,7 @@ static void note(Bus *b, const char *format, ...)
     int size = vsnprintf(text, sizeof text, format, values);
     va_end(values);
     append(&b->text, text, size);
-    b->line.call(NOTE, (int64_t)(intptr_t)b->text.data, b->text.size);
+    run_task(b, NOTE, (int64_t)(intptr_t)b->text.data, b->text.size);
     b->text.size = 0;
 }
 
@@ -491,7 +500,7 @@ static void record(Bus *b, int64_t t_ns, int32_t direction, const char *text, co
     append(&ledger->entries, text, kind[2]);
     append(&ledger->entries, data, size);
     if (ledger->most && ledger->entries.size > ledger->most)
-        b->line.call(LEDGER, 0, 0);
+        run_task(b, LEDGER, 0, 0);
 }
 
 /* Bytes on the line, ordered by their end */
@@ -641,7 +650,7 @@ static int32_t next_piece(Bus *b)
 {
     if (b->line.split != 2)
         return b->line.split ? 1 : UNREAD_LIMIT;
-    int64_t drawn = b->line.call(PIECE, 0, 0);
+    int64_t drawn = run_task(b, PIECE, 0, 0);
     return drawn > 0 ? (int32_t)drawn : 1;
 }
 
@@ -779,7 +788,7 @@ static void send_reply(Bus *b, int32_t id, Transmission *t, int32_t *sent)
     const Transmission *outer = b->disturbed;
     b->disturbed = t;
     b->line.reply = (Reply){t->first_ns, t->due_ns, t->data, t->size, 0};
-    if (b->line.call(DISTURB, id, 0))
+    if (run_task(b, DISTURB, id, 0))
         *sent = 1;
     b->disturbed = outer;
     drop(t);
@@ -877,7 +886,7 @@ static void arrive(Bus *b, Transmission *t)
         }
     }
     if (l->waits && !t->note[0] && !t->broken && t->size > header && !memcmp(t->data, HEADER, (size_t)header))
-        l->call(OVERHEAR, t->data[header], t->due_ns);
+        run_task(b, OVERHEAR, t->data[header], t->due_ns);
     if (t->group && t->group == b->group && b->sent <= t->turn + 1) {
         if (!t->broken)
             send_turns(b, t->due_ns);
@@ -899,7 +908,7 @@ void line_pass_time(Bus *b, int64_t now_ns)
         int64_t due_ns = b->passing.count ? b->passing.at[0]->due_ns : now_ns + 1;
         if (l->planned_ns < due_ns && l->planned_ns <= now_ns) {
             l->now_ns = l->planned_ns > l->now_ns ? l->planned_ns : l->now_ns;
-            l->call(ACT, 0, 0);
+            run_task(b, ACT, 0, 0);
         } else if (due_ns <= now_ns)
             arrive(b, removed(&b->passing, 0));
         else
@@ -1052,7 +1061,7 @@ static int listens_to(const Bus *b, const Node *n, int32_t id)
 static void step_to(Bus *b, int64_t now_ns)
 {
     if (b->line.step(b->line.mechanics, now_ns))
-        b->line.call(STEP, now_ns, 0);
+        run_task(b, STEP, now_ns, 0);
 }
 
 /* Return true if a node receives an instruction that ends at `now_ns`: it is connected, has booted, and is not
@@ -1063,7 +1072,7 @@ static int receives(Bus *b, int32_t index, int64_t now_ns)
     if (n->silent || now_ns < n->deaf_until_ns || !n->speaks)
         return 0;
     if (n->asks) {
-        if (!b->line.call(RECEIVES, index, now_ns))
+        if (!run_task(b, RECEIVES, index, now_ns))
             return 0;
     } else
         step_to(b, now_ns);
@@ -1112,7 +1121,7 @@ static void present(Bus *b, int32_t count, int64_t now_ns)
             left = 1;
     }
     if (left)
-        b->line.call(PRESENT, count, now_ns);
+        run_task(b, PRESENT, count, now_ns);
 }
 
 static int32_t group_read_bit(int32_t instruction)
@@ -1127,14 +1136,14 @@ static int answers_entry(Bus *b, int32_t index, const Packet *p, const Entry *e,
     if (!receives(b, index, now_ns))
         return 0;
     if (!(n->group_reads & group_read_bit(p->instruction)) || b->line.entry_count < n->least_entries) {
-        b->line.call(STAYS_OUT, index, 0);
+        run_task(b, STAYS_OUT, index, 0);
         return 0;
     }
     if (level(n) < 1)
         return 0;
     *error = is_readable(n, e->address, e->length) ? 0 : b->line.protocol == 1 ? 0x08 : 7; /* range, access error */
     if (*error && is_fast(p->instruction)) { /* its format has no room for an error without data [i] */
-        b->line.call(STAYS_OUT, index, 1);
+        run_task(b, STAYS_OUT, index, 1);
         return 0;
     }
     return 1;
@@ -1241,7 +1250,7 @@ static void execute_group_read(Bus *b, const Packet *p, int64_t end_ns)
     present(b, count, end_ns);
     compose_replies(b, is_fast(p->instruction));
     if (b->line.waits)
-        b->line.call(CHAIN, end_ns, 0);
+        run_task(b, CHAIN, end_ns, 0);
     send_turns(b, end_ns);
 }
 
@@ -1315,7 +1324,7 @@ static void execute_for(Bus *b, int32_t index, const Packet *p, int64_t end_ns)
         const uint8_t *data = listed_data(b->line.protocol, p, n, &place, &listed);
         int64_t written = data ? write_goals(n, &place, data) : 0;
         if (written && ((written & ~n->aims) || !n->take_goal(n->shaft, end_ns)))
-            b->line.call(WRITTEN, index, written);
+            run_task(b, WRITTEN, index, written);
         if (written || !listed)
             return;
     }
@@ -1331,11 +1340,11 @@ static void execute_for(Bus *b, int32_t index, const Packet *p, int64_t end_ns)
         ask(b, &count, index, place.address, readable ? place.length : 0);
         present(b, 1, end_ns);
         if (error)
-            b->line.call(REFUSED, index, error);
+            run_task(b, REFUSED, index, error);
         else
             append_registers(&b->sending, n, place.address, place.length);
     } else {
-        error = b->line.call(EXECUTE, index, end_ns);
+        error = run_task(b, EXECUTE, index, end_ns);
         append(&b->sending, b->line.answer, b->line.answer_size);
     }
     if (!replies || error < 0)
@@ -1353,7 +1362,7 @@ static void count_packet(Bus *b)
 {
     b->line.packets++;
     if (b->line.planned_after <= b->line.packets)
-        b->line.call(ACT_AFTER, 0, 0);
+        run_task(b, ACT_AFTER, 0, 0);
 }
 
 static void execute(Bus *b, const Packet *p, int64_t end_ns)
@@ -1364,7 +1373,7 @@ static void execute(Bus *b, const Packet *p, int64_t end_ns)
     l->packet = *p;
     l->end_ns = end_ns;
     if (l->recorded)
-        l->call(EXECUTE_ALL, end_ns, 0);
+        run_task(b, EXECUTE_ALL, end_ns, 0);
     else {
         if (p->size > b->entry_room) {
             b->entry_room = p->size * 2;
@@ -1434,7 +1443,7 @@ static void send_to_servos(Bus *b, const uint8_t *data, int64_t size, int64_t st
         if (b->line.altered) {
             b->line.packet = p;
             b->line.end_ns = end_ns;
-            b->line.call(ALTER, 0, 0);
+            run_task(b, ALTER, 0, 0);
         } else
             execute(b, &p, end_ns);
     }
@@ -1761,7 +1770,7 @@ int32_t line_accept(Terminal *t, int64_t now_ns)
         memcpy(t->settings, &settings, sizeof settings);
         t->known = 1;
         if (settings.c_ospeed && (int64_t)settings.c_ospeed != t->bus->line.baud_rate)
-            t->bus->line.call(RATE, settings.c_ospeed, 0);
+            run_task(t->bus, RATE, settings.c_ospeed, 0);
     }
     line_receive(t->bus, t->chunk, size, now_ns);
     return size;
