@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import signal
+import weakref
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from dxlsim.bus.recording import BusRecording, RecordedPackets
 from dxlsim.bus.simulated_bus import SimulatedBus
 from dxlsim.simulation_plan import WHOLE_REPLIES, AdapterConfig, BusConfig, ServoConfig
 from dxlsim.virtual_ports import VirtualPorts
+from dxlsim.wire import compiled_line
 from dxlwire.clock import VirtualClock
 from dxlwire.exceptions import PortError
 
@@ -115,6 +117,19 @@ def test_an_interrupt_before_a_task_of_the_line_begins_is_not_lost():
     bus._line.step, bus._line.mechanics = ctypes.cast(library["raise"], ctypes.c_void_p), signal.SIGINT
     with pytest.raises(KeyboardInterrupt):
         bus.receive_bytes(PING_1, 0)
+
+
+def test_the_exit_of_the_interpreter_frees_no_line_that_a_thread_may_still_serve(monkeypatch):
+    made: list[weakref.finalize] = []
+
+    def finalize(*given) -> weakref.finalize:
+        made.append(weakref.finalize(*given))
+        return made[-1]
+
+    monkeypatch.setattr(compiled_line, "finalize", finalize)
+    bus = new_bus()
+    assert [each.atexit for each in made if each.alive] == [False, False]
+    del bus
 
 
 def test_a_host_that_sends_within_the_return_delay_is_received():

@@ -169,8 +169,8 @@ def new_ledger(owner: object) -> ctypes.Structure:
 
 
 def _free_with(owner: object, name: str, memory: object) -> None:
-    """Free memory by a function of the library as soon as its owner is gone. At the exit of the interpreter it
-    stays: the thread of a served bus may still use it."""
+    """Free memory by a function of the library as soon as its owner is gone. At the exit of the interpreter
+    it stays: the thread of a served bus may still use it."""
     finalize(owner, line_function(name), memory).atexit = False
 
 
