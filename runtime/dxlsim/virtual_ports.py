@@ -121,7 +121,7 @@ class VirtualPorts:
         raise."""
         if self._state.raised:
             raised, self._raised, self._state.raised = self._raised, None, 0
-            raise raised or AssertionError
+            raise raised or KeyboardInterrupt  # As in `SimulatedBus.raise_stored`
         for bus in self._buses:
             bus.raise_stored()
 
@@ -131,3 +131,5 @@ class VirtualPorts:
         except BaseException as error:
             self._raised, self._state.raised = error, 1
             return 0
+        finally:
+            self._state.done = 1

@@ -19,6 +19,7 @@ from dxlsim.bus.simulated_bus import SimulatedBus
 from dxlsim.simulation_plan import WHOLE_REPLIES, AdapterConfig, BusConfig, ServoConfig
 from dxlsim.virtual_ports import VirtualPorts
 from dxlsim.wire import compiled_line
+from dxlsim.wire.compiled_line import ADVANCE
 from dxlwire.clock import VirtualClock
 from dxlwire.exceptions import PortError
 
@@ -373,6 +374,22 @@ def test_waiting_ends_at_the_deadline():
     two.buses[0].at(MS, lambda: two.buses[0].inject_noise(b"\x55", MS))
     assert two.ports.wait_for_bytes(2 * MS) == [0]  # planned while somebody waits
     assert two.read(0) == b"\x55"
+
+
+@pytest.mark.filterwarnings("ignore:Exception ignored on calling ctypes")
+def test_an_interrupt_before_a_scheduled_call_is_not_lost():
+    two, ends = TwoPorts(), iter((KeyboardInterrupt,))
+
+    @ADVANCE
+    def interrupted(until_ns: int) -> int:
+        for end in ends:
+            raise end
+        return two.clock.wait_until(until_ns)
+
+    two.clock.call_at(1_000, lambda: None)
+    two.ports._state.advance = ctypes.cast(interrupted, ctypes.c_void_p)
+    with pytest.raises(KeyboardInterrupt):
+        two.ports.wait_for_bytes(5_000)
 
 
 def test_bytes_that_do_not_fit_stay_for_the_next_read():

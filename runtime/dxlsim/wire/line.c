@@ -1534,6 +1534,7 @@ typedef struct {
     int64_t *clock;                      /* dxlwire's VirtualClock: the time, and the time of the next scheduled call */
     int64_t (*advance)(int64_t until_ns); /* lets the clock make the calls that are due */
     int32_t count, raised;               /* `raised`: `advance` raised an exception */
+    int32_t done, unused;                /* as in Line */
 } Ports;
 
 static int32_t is_gone(const Port *p) { return p->bus->line.unplugged != p->opened; }
@@ -1543,9 +1544,11 @@ static int64_t ports_now(void *context) { return ((Ports *)context)->clock[0]; }
 static void ports_sleep(void *context, int64_t until_ns)
 {
     Ports *p = context;
-    if (p->clock[1] <= until_ns)
+    if (p->clock[1] <= until_ns) {
+        p->done = 0;
         p->advance(until_ns);
-    else if (until_ns > p->clock[0])
+        p->raised |= !p->done;
+    } else if (until_ns > p->clock[0])
         p->clock[0] = until_ns;
 }
 
