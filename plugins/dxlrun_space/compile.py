@@ -40,6 +40,9 @@ def _solved(compilation: Compilation, pose: form.TipPose) -> Row | None:
         return None
     chain = Chain(body.urdf, pose.base, pose.tip)
     for joint in chain.joints:
+        if joint in file.description.omitted:
+            what = f"{joint} moves {pose.tip}, but is omitted"
+            raise WrongChain("tip", what, f"remove the pose, or run with {joint}")
         if joint not in file.robot.joints:
             raise WrongChain("tip", f"{joint} moves {pose.tip}, but has no servo", f"add {joint} to `joints`")
     for joint in pose.near:

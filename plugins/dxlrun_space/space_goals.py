@@ -46,11 +46,15 @@ def _angles(value: object) -> object:
 
 
 def _floats(value: object) -> object:
-    """Convert numbers with commas between them."""
+    """Convert numbers with commas between them, and a list."""
     try:
-        return tuple(map(float, value.split(","))) if isinstance(value, str) else value
+        return tuple(map(float, value.split(","))) if isinstance(value, str) else _tuple(value)
     except ValueError:
         return value
+
+
+def _tuple(value: object) -> object:
+    return tuple(value) if isinstance(value, list) else value
 
 
 def _rad(value: object) -> object:

@@ -237,16 +237,22 @@ def _right_form(error: CycloptsError, tokens: Sequence[str]) -> str:
         return shlex.join(("dxlrun", *verb, *(word for word in given if word not in ("=", ":="))))
     if verb == ["switch"] and isinstance(error, UnusedCliTokensError):
         return shlex.join(("dxlrun", *verb, "--activate", *given))
-    if isinstance(error, MissingArgumentError) and verb:
+    place = error.argument
+    if isinstance(error, MissingArgumentError) and verb and place and place.field_info.is_positional:
         # `set base gain=400`, `set base.gain 400`: two words were joined to one.
         for sign in (":=", "=", "."):
-            words = [part for word in given for part in ([word] if word[:1] == "-" else word.split(sign, 1))]
+            words = [part for word in given for part in _parts(word, sign)]
             if len(words) == len(given) + 1 and all(words):
                 return shlex.join(("dxlrun", *verb, *words))
     if isinstance(error, CoercionError) and verb == ["torque"] and {"on", "off"} & set(given[1:]):
         state = next(word for word in given if word in ("on", "off"))
         return shlex.join(("dxlrun", "torque", state, *(word for word in given if word != state)))
     return ""
+
+
+def _parts(word: str, sign: str) -> list[str]:
+    whole = word.startswith("-") or word.endswith((".yaml", ".yml"))
+    return [word] if whole else word.split(sign, 1)
 
 
 def _without_options(error: UnknownOptionError, verb: Sequence[str], given: Sequence[str]) -> str:

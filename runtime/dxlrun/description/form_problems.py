@@ -53,6 +53,8 @@ def problems_of(
         if one.meant and not any(one.path[:end] in unknown for end in range(len(one.path) + 1)):
             found.setdefault(one.path, []).append(one)
     problems = [_merged(errors, marks) for errors in _explain_unknown_keys(found, marks, document)]
+    # A list with two values too few has the same problem twice.
+    problems = [*dict.fromkeys(problems)]
     return sorted(problems, key=lambda problem: problem.mark)
 
 
