@@ -32,7 +32,7 @@ WITHOUT_TABLE = {
 def forms(kind: type[Form]) -> Iterator[type[Form]]:
     """Yield all forms of the program that are made of one."""
     for below in kind.__subclasses__():
-        if below.__module__.startswith(("dxlrun.description.", "dxlrun.features.")):
+        if below.__module__.startswith(("dxlrun.description.", "dxlrun.features.", "dxlrun_space.")):
             yield below
         yield from forms(below)
 

@@ -21,7 +21,7 @@ from dxlrun.description.joints.joint_forms import BareJoint, Joint, SharedJoint
 from dxlrun.description.joints.joint_mechanics import OneOfServos
 from dxlrun.description.robot import Group, GroupPolicies, Policies, Robot, robot_form
 from dxlrun.errors import InputError
-from dxlrun.features import FEATURES, RESERVED, stages
+from dxlrun.features import FEATURES, RESERVED, installed_features, stages
 from dxlrun.features.feature import Feature, JointKey, PolicyKey, Section, ServoKey
 from dxlrun.installed_plugins import InstalledPlugin
 from dxlrun.testing import installed, plan_of
@@ -33,7 +33,9 @@ ROBOT = ROOT / "robots" / "bioloid_torso.yaml"
 def test_each_feature_has_the_section_of_its_name():
     sections = {feature.name: section for feature, section in stages(Section, FEATURES)}
     assert {name: section.name for name, section in sections.items()} == {name: name for name in sections}
-    assert robot_form().model_fields.keys() - Robot.model_fields.keys() == sections.keys()
+    of_plugins = {section.name for _, section in stages(Section, installed_features())} - sections.keys()
+    assert of_plugins == {"tip_poses"}
+    assert robot_form().model_fields.keys() - Robot.model_fields.keys() == sections.keys() | of_plugins
 
 
 def test_all_files_of_features_are_on_the_page_of_the_architecture():

@@ -302,7 +302,7 @@ SETUP: dict[str, Callable[..., object]] = {
     r"before (read|write) (\d+) (\d+)(?: = (\d+))?(?: times (\d+)-(\d*))?: (.+)": (
         lambda case, *found: case.act_before(found[:3], *found[3:])
     ),
-    r"bus echoes": lambda case: setattr(case.rig.buses[0], "echo", True),
+    r"bus echoes": lambda case: setattr(case.rig.buses[0]._line, "echo", 1),
     r"start": Case.begin,
 }
 AFTER_START: dict[str, Callable[..., object]] = {

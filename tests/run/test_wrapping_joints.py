@@ -133,6 +133,7 @@ class Story:
 
 def test_each_standard_controller_that_takes_positions_is_in_the_matrix() -> None:
     assert {one.case.type for one in steered()} - {one.case.type for one in ways()} == {
+        "cartesian_controller",  # by poses; the positions are those of its solver
         "diff_drive_controller",
         "joint_group_effort_controller",
         "joint_group_poseffort_controller",  # not offered for a continuous joint
