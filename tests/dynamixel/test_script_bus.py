@@ -82,8 +82,10 @@ def test_servos_that_are_absent_or_of_another_model_are_refused(script):
     kinds = {servo_id: one.kind for servo_id, one in caught.value.failures.items()}
     assert kinds == {2: "wrong_model", 9: "no_reply"}
     assert str(caught.value).splitlines()[0] == "ID 2 on line is XM430-W350, not XL430-W250"
-    with pytest.raises(LookupError, match="known models"):
+    with pytest.raises(LookupError, match="`dxlrun models` lists all"):
         script.bus.servos({1: "SG90"})
+    with pytest.raises(LookupError, match="did you mean XL430-W250"):
+        script.bus.servos({1: "XL430-W25"})
     with pytest.raises(ValueError, match="ID 254 does not exist; IDs are 0 to 252"):
         script.bus.servos({254: "XM430-W350"})
 

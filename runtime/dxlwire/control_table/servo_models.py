@@ -35,9 +35,7 @@ def find_table(model: str, protocol: float | None = None) -> ControlTable:
         return table
     spoken = protocols_of(model)
     if not spoken:
-        raise LookupError(
-            f"no control table for the model {model!r}; known models: {', '.join(model_names())}"
-        )
+        raise LookupError(f"no control table for the model {model!r}; {perhaps_meant(model, protocol)}")
     if protocol is not None and protocol not in spoken:
         raise LookupError(f"{model} uses Protocol {spoken[0]}, not Protocol {protocol}")
     if protocol is None and len(spoken) > 1:
