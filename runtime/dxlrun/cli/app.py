@@ -139,7 +139,7 @@ class _Help:
 
 def _about(entry: HelpEntry) -> str:
     choices = f"One of {', '.join(entry.choices)}." if entry.choices else ""
-    default = f"Default: {entry.default}." if entry.default is not None else ""
+    default = f"Default: {entry.default}." if entry.default not in (None, '""') else ""
     return " ".join(filter(None, (_filled(entry.description), choices, default)))
 
 
