@@ -29,7 +29,7 @@ SIGNS = (1, 1, -1, 1, 1)
 
 def test_an_arm_of_four_joints_follows_a_hand_at_one_of_five() -> None:
     robot = simulated_robot(ROBOT, duration_s=6.0)
-    leader = next(bus for bus in robot.buses if bus.name == "leader")
+    leader = next(bus for bus in robot.buses if bus.name == "koch")
     turns = (0.5, 0.3, 0.4, -0.2, 0.0)
     for number, (turn, sign) in enumerate(zip(turns, SIGNS, strict=True), 1):
         leader.at(3_000_000_000, lambda n=number, t=turn * sign: leader.servo(n).turn_shaft(t, 500_000_000))
