@@ -251,8 +251,10 @@ def test_writer_sends_each_goal_in_each_call_within_the_range_of_the_item(script
     assert [int.from_bytes(packet[at : at + 4], "little") for at in (13, 22, 31)] == [32767, 0, 32767]
     with pytest.raises(TypeError, match="takes 2 values"):
         write(1.0)
-    with pytest.raises(ValueError, match="broadcast"):
+    with pytest.raises(ValueError, match="argument 1: 2 values for 3 servos"):
         write([1.0, 2.0], 1.0)
+    with pytest.raises(ValueError, match="could not convert string"):
+        write("far", 1.0)
     for item, words in (
         ("operating_mode", "in the EEPROM"),
         ("present_load", "no item"),

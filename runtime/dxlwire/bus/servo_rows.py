@@ -136,12 +136,18 @@ class WrittenRows(ABC):
         """Send one packet for each block of items, which no servo acknowledges.
 
         Raises:
+            ValueError: An argument has more or fewer values than servos, or no numbers.
             PortError: The line is closed or lost.
         """
         if len(values) != self._count:
             raise TypeError(f"this writer takes {self._count} values, one for each item; got {len(values)}")
         for row, value in enumerate(values):
-            self._goals[row] = value
+            try:
+                self._goals[row] = value
+            except ValueError:
+                if (given := np.size(value)) in (1, servos := self._goals.shape[1]):
+                    raise  # Not numbers
+                raise ValueError(f"argument {row + 1}: {given} values for {servos} servos") from None
         goals = self._goals[: self._count]
         if self._count > 1 and math.isnan(goals.sum()):  # Quicker than to look at each goal
             # Half of a servo's values would be sent with zeros or old ones for the rest
