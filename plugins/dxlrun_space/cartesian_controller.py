@@ -154,7 +154,7 @@ class PosePlan:
     duration: float
     """Shortest duration, s; NaN without a motion."""
     text: str
-    """Reason why there is no motion, or what is not reached."""
+    """Reason for no motion, or the part of the pose that is not reached."""
 
 
 @unique

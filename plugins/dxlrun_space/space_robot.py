@@ -61,9 +61,11 @@ class SpaceRobot(RemoteRobot):
             Refused: The pose is malformed, or there is no such arm.
             GoalTimeout: The motion has not ended within `timeout`.
         """
-        values = (x, y, z, dx, dy, dz, rpy, drpy, quaternion, frame, path, seconds)
-        names = ["x", "y", "z", "dx", "dy", "dz", "rpy", "drpy", "quaternion", "frame", "path", "seconds"]
-        pose = {name: value for name, value in zip(names, values, strict=True) if value is not None}
+        fields = {
+            "x": x, "y": y, "z": z, "dx": dx, "dy": dy, "dz": dz, "rpy": rpy, "drpy": drpy,
+            "quaternion": quaternion, "frame": frame, "path": path, "seconds": seconds,
+        }  # fmt: skip
+        pose = {name: value for name, value in fields.items() if value is not None}
         goal = self.send(arm or self._only_arm(), "pose", pose).goal
         if goal is None:
             raise DxlrunError(f"{arm} does not move to poses; name a cartesian_controller")

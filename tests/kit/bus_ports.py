@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from dxlsim.virtual_ports import VirtualPort
 from dxlwire.clock import VirtualClock
 from dxlwire.exceptions import PortError
 
 
-class BusPort:
-    """Host's end of one simulated bus on virtual time; implements `dxlwire`'s Port."""
+class BusPort(VirtualPort):
+    """Host's end of one simulated bus, whose methods a test may replace: the exchange calls them."""
 
     def __init__(self, clock: VirtualClock, bus: Any) -> None:
         self._clock = clock
@@ -38,18 +39,6 @@ class BusPort:
         """Return the exception for a failed write; the only cause is an unplugged adapter."""
         return PortError(f"the adapter of bus {self._bus.name} is unplugged")
 
-    def extend_deadline(self, deadline_ns: int, off_wire_ns: int, heard_ns: int, now_ns: int) -> int:
-        """Return `deadline_ns`: virtual time waits for the servos, so none is stalled."""
-        return deadline_ns
-
-    def stalled_ns(self, since_ns: int, until_ns: int) -> int:
-        """Return 0: virtual time waits for the servos, so none is stalled."""
-        return 0
-
-    def late_ns(self, off_wire_ns: int, heard_ns: int) -> int:
-        """Return 0: virtual time waits for the servos, so none is stalled."""
-        return 0
-
     def collect_bytes(self) -> bool:
         """Take the bytes that have passed the wire from the bus; return True if bytes are waiting or the
         adapter is gone."""
@@ -57,18 +46,10 @@ class BusPort:
             self._arrived += data
         return bool(self._arrived) or self._gone
 
-    def unplug(self) -> None:
-        """Unplug the adapter: every later use of this port raises PortError."""
-        self._bus.unplug()
-
     @property
     def _gone(self) -> bool:
         """True after the adapter was unplugged, even if it is back: a port is not reusable after that."""
         return self._bus.times_unplugged != self._unplugged
-
-    def _check(self) -> None:
-        if self._gone:
-            raise self.failure(-1)
 
 
 class BusPorts:

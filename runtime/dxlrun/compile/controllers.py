@@ -86,8 +86,8 @@ def compile_controllers(
     """
     compiled: dict[str, CompiledController] = {}
     plans: list[ControllerPlan] = []
-    for name, entry in file.robot.controllers.items():
-        entry = entry.model_copy(update={"parameters": _with_poses(entry.parameters, poses)})  # noqa: PLW2901
+    for name, written in file.robot.controllers.items():
+        entry = written.model_copy(update={"parameters": _with_poses(written.parameters, poses)})
         plan = plan_entry(name, entry, _every(file, name, entry.rate))
         one = _compiled(file, plan, plugins, entry)
         if one is not None:

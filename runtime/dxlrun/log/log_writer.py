@@ -40,7 +40,7 @@ _COMPRESSED_FROM = 16 * 1024
 _LIBRARY = "dxlrun"
 _PACKAGE = "dxlrun_msgs"
 _LIBRARIES = ("dxlrun", "mcap", "numpy")
-# The library has no option for the level.
+# mcap.writer names no level and has no option for it. Other writers of this process get this level, too.
 setattr(mcap.writer, "zstandard", SimpleNamespace(compress=partial(zstandard.compress, level=LEVEL)))  # noqa: B010
 _MEDIA_TYPES = {".json": "application/json", ".yaml": "application/yaml", ".txt": "text/plain"}
 

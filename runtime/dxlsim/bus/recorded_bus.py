@@ -17,13 +17,12 @@ from dxlsim.bus.recording import BusRecording, RecordedPackets, RecordedReply
 from dxlsim.bus.simulated_bus import SimulatedBus
 from dxlsim.motion.mechanics import Mechanics
 from dxlsim.simulation_plan import BusConfig
-from dxlsim.wire.compiled_line import InstructionReceiver, group_read, read_place, status_packet
+from dxlsim.wire.compiled_line import InstructionReceiver, group_read, line_library, read_place, status_packet
 from dxlsim.wire.servo_packets import BROADCAST, Instruction, InstructionPacket, ReadEntry
 
 _MODEL, _FIRMWARE = (0, 1), (6,)
 """Addresses of the data in a ping answer of Protocol 2.0 (e-Manual, X series, Control Table). Other models
 have the firmware elsewhere, so their unrecorded pings are not answered."""
-_RATE_TOLERANCE = 0.03  # As on a line with servos (e-Manual, Baud Rate (4))
 _Sent = tuple[int, int, bytes]  # Begin and end on the wire, ns, and bytes
 _ANSWER_NS = 500_000  # Delay of a constructed answer: Return Delay Time at its factory setting (e-Manual)
 
@@ -50,7 +49,7 @@ class RecordedBus(SimulatedBus):
         self._line.recorded = 1
 
     def _execute_all(self, packet: InstructionPacket, end_ns: int) -> None:
-        if abs(self.baud_rate - self._recorded_rate) < _RATE_TOLERANCE * self.baud_rate:
+        if line_library().line_rates_match(self._recorded_rate, self.baud_rate):
             heard = self._recording.replay_answer(packet.raw)
             if heard is None:
                 heard = self._known(packet)

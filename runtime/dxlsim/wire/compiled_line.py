@@ -101,6 +101,7 @@ _FUNCTIONS: dict[str, tuple[type | None, tuple[object, ...]]] = {
     "port_receive": (c_int32, (c_void_p, c_int32, c_void_p, c_int32)),
     "port_send": (c_int32, (c_void_p, c_int32, c_char_p, c_int32)),
     "port_wait": (c_int32, (c_void_p, c_int64, c_void_p)),
+    "rates_match": (c_int32, (c_int64, c_int64)),
     "read": (c_int32, (c_int32, c_char_p, c_int32, c_void_p)),
     "read_chunk": (c_int32, (c_void_p,)),
     "receive": (None, (c_void_p, c_char_p, c_int64, c_int64)),

@@ -39,7 +39,6 @@
 #define STATUS_BYTES 11   /* status packet of Protocol 2.0 without data: the slot of an absent servo has this length [i] */
 #define PING_REPLY 14     /* bytes of a reply to a ping, Protocol 2.0 */
 #define SLOT_NS 1000000   /* time by which a servo's slot after a broadcast ping exceeds its reply [i] */
-#define RATE_TOLERANCE 0.03 /* largest relative difference between host and servo (e-Manual, Baud Rate (4)) */
 #define LATENESSES 1000
 #define NOTE_ROOM 16
 
@@ -1049,12 +1048,17 @@ static void append_registers(Bytes *to, const Node *n, int32_t address, int32_t 
 
 /* Instructions */
 
+/* 1: a unit receives what the host sends: their rates differ by less than 3 % (e-Manual, Baud Rate (4)) */
+int32_t line_rates_match(int64_t unit, int64_t host)
+{
+    return fabs((double)unit - (double)host) < 0.03 * (double)host;
+}
+
 static int listens_to(const Bus *b, const Node *n, int32_t id)
 {
-    double rate = b->line.baud_rate;
     if (id != BROADCAST && id != n->id && id != n->secondary_id)
         return 0;
-    return fabs(n->baud_rate - rate) < RATE_TOLERANCE * rate;
+    return line_rates_match(n->baud_rate, b->line.baud_rate);
 }
 
 /* Advance the mechanics to `now_ns`, if a step is due. */
@@ -1639,8 +1643,8 @@ int32_t line_port_wait(Ports *p, int64_t deadline_ns, uint8_t *ready) { return p
 #define POLL_SHARE 20                /* polling is limited to one part in this many of the time of waiting */
 #define BUDGET_NS 20000000
 #define PAUSE_NS 100000              /* shortest sleep while polling is not allowed */
-#define MOST_TERMINALS 256
-#define OTHERS 4                     /* descriptors of Python that wake the server as well */
+#define EVENTS_A_LOOK 64             /* the others wait for the next look */
+#define OF_PYTHON UINT64_MAX         /* number of each descriptor of Python, which wakes the server as well */
 
 enum { TAKEN, SERVED, GIVEN, DUE }; /* words of a line's progress, for the host: heartbeat.py */
 enum { ADAPTER = 1, ASKED_FOR = 2, RAISED = 4 }; /* what Python has to do */
@@ -1832,13 +1836,13 @@ static void receive_from(Server *s, int32_t index, int64_t now_ns)
         watch(s, index, EPOLL_CTL_MOD); /* reports the waiting bytes once more */
 }
 
-/* Look which descriptors are ready. Descriptors of Python have numbers from MOST_TERMINALS on. */
+/* Look which descriptors are ready. */
 static int32_t look(Server *s)
 {
-    struct epoll_event events[MOST_TERMINALS + OTHERS];
-    int32_t count = epoll_wait(s->waiting, events, MOST_TERMINALS + OTHERS, 0), found = 0;
+    struct epoll_event events[EVENTS_A_LOOK];
+    int32_t count = epoll_wait(s->waiting, events, EVENTS_A_LOOK, 0), found = 0;
     for (int32_t i = 0; i < count; i++, found++)
-        if (events[i].data.u64 < MOST_TERMINALS)
+        if (events[i].data.u64 != OF_PYTHON)
             s->terminals[events[i].data.u64]->ready = 1;
         else
             s->news |= ASKED_FOR;
@@ -1932,7 +1936,7 @@ void line_plug(Server *s, int32_t index)
 /* Wake also when a descriptor of Python is readable. */
 void line_watch(Server *s, int32_t descriptor)
 {
-    struct epoll_event event = {.events = EPOLLIN, .data.u64 = MOST_TERMINALS};
+    struct epoll_event event = {.events = EPOLLIN, .data.u64 = OF_PYTHON};
     epoll_ctl(s->waiting, EPOLL_CTL_ADD, descriptor, &event);
 }
 
