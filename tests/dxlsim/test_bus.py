@@ -112,6 +112,16 @@ def test_any_rate_of_a_terminal_is_one_at_which_a_host_talks_into_a_reply(baud_r
     assert bus.drain_bytes(LATER)[:2] == PONG_1[:2]
 
 
+@pytest.mark.parametrize(
+    ("baud_rate", "hears"), [(971_000, True), (1_030_000, True), (970_000, False), (1_031_000, False)]
+)
+def test_a_servo_hears_a_host_whose_rate_differs_by_less_than_three_percent(baud_rate, hears):
+    bus = new_bus()
+    bus.baud_rate = baud_rate
+    bus.receive_bytes(READ_1, 0)
+    assert (bus.drain_bytes(LATER) != b"") == hears
+
+
 @pytest.mark.filterwarnings("ignore:Exception ignored on calling ctypes")
 def test_an_interrupt_before_a_task_of_the_line_begins_is_not_lost():
     bus, library = new_bus(), ctypes.CDLL(None)
