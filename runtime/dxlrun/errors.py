@@ -28,7 +28,17 @@ from importlib.util import find_spec
 from types import MappingProxyType
 
 from dxlwire.exceptions import DxlError as DxlrunError
-from dxlwire.exceptions import InputError, Mark, PortError, Problem, counted, help_link, near, suggestion
+from dxlwire.exceptions import (
+    InputError,
+    Mark,
+    PortError,
+    Problem,
+    counted,
+    help_link,
+    near,
+    suggestion,
+    what_and_fix,
+)
 
 __all__ = [
     "ControllerFault",
@@ -51,6 +61,7 @@ __all__ = [
     "near",
     "suggestion",
     "told_once",
+    "what_and_fix",
 ]
 
 

@@ -49,6 +49,15 @@ class Problem:
         return f"{self.mark}: {kind}{self.what}; {self.fix}"
 
 
+def what_and_fix(sentence: object) -> tuple[str, str]:
+    """Return the parts of a text or error of the form `problem; fix`; without a fix, that part is empty.
+
+    Validators raise a ValueError of this form, also those of plug-ins.
+    """
+    what, _, fix = str(sentence).partition("; ")
+    return what, fix
+
+
 class DxlError(Exception):
     """Base class of every error that is raised on purpose, here and in the packages that build on dxlwire.
 

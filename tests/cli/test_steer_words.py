@@ -15,7 +15,8 @@ from dxlrun.output.terminal import show_parts
 
 WRONG = {
     "paths": ["/positions/0", "/velocities/0"],
-    "problems": ["positions[0]: no unit; add it", "v: no; b"],
+    "problems": ["positions[0]: no unit", "v: no"],
+    "fixes": ["add it", "b"],
 }
 REFUSED = Refused("...", code="wrong_quantity", fields=WRONG, wrong_input=True)
 
@@ -32,7 +33,7 @@ def test_wrong_quantity_is_reported_at_its_place_in_the_file(tmp_path: Path) -> 
 def test_wrong_quantities_of_the_command_line_are_a_line_each_and_keep_their_code() -> None:
     located = WrittenEntry.from_words(["positions=[30]", "velocities=[true]"], None).located(REFUSED)
     assert isinstance(located, Refused)
-    assert str(located).splitlines() == WRONG["problems"]
+    assert str(located).splitlines() == ["positions[0]: no unit; add it", "v: no; b"]
     assert (located.code, located.exit_code) == ("wrong_quantity", 2)
     other = Refused("no", code="not_active")
     assert WrittenEntry.from_words((), None).located(other) is other

@@ -1,5 +1,3 @@
-# ruff: noqa: E501 (a request and its answer are read best side by side)
-
 """The gateway by ASGI: which requests reach the loop, how they are answered, and what a failure costs."""
 
 import asyncio
@@ -95,9 +93,13 @@ def test_every_wrong_quantity_is_refused_with_its_place(desk):
     assert (status, content["code"]) == (422, "wrong_quantity")
     assert content["fields"]["paths"] == ["/positions/0", "/positions/1", "/velocities/0"]
     assert content["fields"]["problems"] == [
-        "positions[0]: 30 has no unit; write an angle with its unit, such as 60 deg or 1.05 rad",
-        "positions[1]: '1 rad/s' has the wrong unit rad/s for an angle; write an angle such as 60 deg or 1.05 rad",
-        "velocities[0]: this is not an angular velocity; "
+        "positions[0]: 30 has no unit",
+        "positions[1]: '1 rad/s' has the wrong unit rad/s for an angle",
+        "velocities[0]: this is not an angular velocity",
+    ]
+    assert content["fields"]["fixes"] == [
+        "write an angle with its unit, such as 60 deg or 1.05 rad",
+        "write an angle such as 60 deg or 1.05 rad",
         "write an angular velocity such as 2 rad/s, 30 deg/s or 5 rpm",
     ]
     assert desk.ask("POST", path, b"[")[1]["code"] == "invalid"

@@ -37,7 +37,7 @@ from dxlrun.description.form_problems import errors_between_keys, problems_of
 from dxlrun.description.mistakes.ros_types import ros_type
 from dxlrun.description.reading import Description
 from dxlrun.description.robot import ControllerEntry
-from dxlrun.errors import Mark
+from dxlrun.errors import Mark, what_and_fix
 from dxlrun.features import stages
 from dxlrun.plan.loop_plan import ControllerPlan, RegisterPlan
 from dxlrun.plan.mechanics_plan import MechanicsPlan
@@ -356,7 +356,7 @@ def compile_registers(
                     if servo.certain:
                         file.error(mark, f"{servo.described.title}: {error.what}", error.fix)
                 except ValueError as error:
-                    what, _, fix = str(error).partition("; ")
+                    what, fix = what_and_fix(error)
                     file.error(mark, f"{one.item} of {servo.described.title}: {what}", fix)
         registers = (replace(plan, writes=tuple(found.items())) for plan, found in writes.items())
         plans.append(replace(controller.plan, registers=tuple(registers)))

@@ -50,7 +50,7 @@ from dxlrun.description.motion import (
     read_motion,
 )
 from dxlrun.description.units import Measure
-from dxlrun.errors import InputError, Mark, suggestion
+from dxlrun.errors import InputError, Mark, suggestion, what_and_fix
 from dxlrun.plan.loop_plan import SETTLE_NS, JointPlan, ScheduledCommand, ScheduledGoal
 from dxlrun.plan.robot_plan import MotionPart
 from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
@@ -205,7 +205,7 @@ def _resolve_motion(
             else read_motion(found.path, file.description.groups, file.description.omitted)
         )
     except InputError as error:
-        what, _, fix = str(error).partition("; ")
+        what, fix = what_and_fix(error)
         if error.problems:
             file.extend(error.problems)
         elif len(controllers) == len(file.robot.controllers):

@@ -16,7 +16,7 @@ from dxlrun.description.document import KeyPath, Marks, PlainDocument, plain_val
 from dxlrun.description.mistakes.syntax import list_text
 from dxlrun.description.mistakes.words import Remedy, UnknownKeyContext
 from dxlrun.description.units import bound_text, example_of, units_of
-from dxlrun.errors import InputError, Mark, Problem, suggestion
+from dxlrun.errors import InputError, Mark, Problem, suggestion, what_and_fix
 from dxlrun.features import broken_features
 
 Form = TypeVar("Form", bound=BaseModel)
@@ -117,7 +117,7 @@ def _each_of(errors: Iterable[ErrorDetails]) -> Iterator[ErrorDetails]:
             yield details
             continue
         for path, text in several.found:
-            what, _, fix = text.partition("; ")
+            what, fix = what_and_fix(text)
             context = {"what": what, "fix": fix}
             yield {**details, "type": "dxlrun", "loc": (*details["loc"], *path), "ctx": context}
 
@@ -477,8 +477,7 @@ def _sentence_unknown(error: _Error) -> tuple[str, str]:
     if key in refused:
         return f"{path_text(error.path)} is not allowed here", refused[key]
     if why := broken_features().get(key):
-        what, _, fix = why.rpartition("; ")
-        return what, fix
+        return what_and_fix(why)
     if error.remedy is not None:
         keys = error.remedy.keys
         named = f"an unknown key {key!r}" if len(keys) == 1 else f"unknown keys {keys[0]!r} and {keys[1]!r}"
@@ -502,7 +501,7 @@ def _sentence_own(error: _Error) -> tuple[str, str]:
     if "what" in error.context and "fix" in error.context:
         what, fix = str(error.context["what"]), str(error.context["fix"])
     else:
-        what, _, fix = str(error.context.get("error", "the value is not accepted")).partition("; ")
+        what, fix = what_and_fix(error.context.get("error", "the value is not accepted"))
     return f"{error.path_name}: {what}", fix or "correct it"
 
 

@@ -6,14 +6,12 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
+from dxlrun.errors import Problem, what_and_fix
 from dxlrun.output.escaping import escaped_json
 
-if TYPE_CHECKING:
-    from dxlrun.errors import Problem
-
-Report: TypeAlias = "Sequence[Problem | str]"
+Report: TypeAlias = Sequence[Problem | str]
 """Errors or warnings: problems with places in files, or sentences `problem; fix`."""
 NO_REASON: Mapping[str, object] = MappingProxyType({})
 
@@ -62,7 +60,7 @@ def _plain(value: object) -> object:
 def _problem(problem: Problem | str) -> dict[str, object]:
     """Return a problem as a JSON object; a sentence has null for file, line and column."""
     if isinstance(problem, str):
-        what, _, fix = problem.partition("; ")
+        what, fix = what_and_fix(problem)
         place: tuple[object, ...] = None, None, None
     else:
         what, fix, mark = problem.what, problem.fix, problem.mark

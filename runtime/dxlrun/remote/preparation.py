@@ -43,7 +43,7 @@ from dxlrun.description.units import (
     linear_acceleration,
     linear_velocity,
 )
-from dxlrun.errors import suggestion
+from dxlrun.errors import suggestion, what_and_fix
 from dxlrun.plan.loop_plan import ControllerPlan, JointPlan, ServoLimit, SourcePlan
 from dxlrun.remote import texts
 from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
@@ -451,13 +451,10 @@ def in_si(body: bytes, what: str, joints: Sequence[JointPlan] = ()) -> bytes:
         data = msgspec.json.decode(body)
     except (msgspec.MsgspecError, RecursionError) as error:
         raise invalid(texts.not_json(what, error)) from error
-    mistaken: list[tuple[str, str]] = []
+    mistaken: dict[str, str] = {}
     plain = _plain(data, (), mistaken, _units_of(data, joints))
     if mistaken:
-        paths, problems = zip(*mistaken[:_MOST_QUANTITIES], strict=True)
-        raise refused(
-            Code.WRONG_QUANTITY, {"problem": "; ".join(problems), "paths": paths, "problems": problems}
-        )
+        raise _wrong_quantities(mistaken)
     return msgspec.json.encode(plain)
 
 
@@ -484,18 +481,14 @@ def plain_quantities(
             quantity = _QUANTITIES[units.get(joint, ROTARY)][field]
             plain[joint] = quantity(value)
         except ValueError as error:
-            mistaken[joint] = f"{joint}: {error}"
+            mistaken[f"/{joint}"] = f"{joint}: {error}"
     if mistaken:
-        problems = tuple(mistaken.values())[:_MOST_QUANTITIES]
-        paths = tuple(f"/{joint}" for joint in mistaken)[:_MOST_QUANTITIES]
-        raise refused(
-            Code.WRONG_QUANTITY, {"problem": "; ".join(problems), "paths": paths, "problems": problems}
-        )
+        raise _wrong_quantities(mistaken)
     return plain
 
 
 def _plain(
-    value: object, path: tuple[str | int, ...], mistaken: list[tuple[str, str]], units: Sequence[JointUnit]
+    value: object, path: tuple[str | int, ...], mistaken: dict[str, str], units: Sequence[JointUnit]
 ) -> object:
     if isinstance(value, dict):
         return {key: _plain(inner, (*path, key), mistaken, units) for key, inner in value.items()}
@@ -510,8 +503,16 @@ def _plain(
         return quantity(value)
     except ValueError as error:
         shown = "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in path)
-        mistaken.append(("".join(f"/{step}" for step in path), f"{shown.removeprefix('.')}: {error}"))
+        mistaken["".join(f"/{step}" for step in path)] = f"{shown.removeprefix('.')}: {error}"
         return None
+
+
+def _wrong_quantities(mistaken: Mapping[str, str]) -> RefusedRequest:
+    """Return the refusal of wrong quantities, whose sentences are given by JSON Pointer."""
+    shown = dict([*mistaken.items()][:_MOST_QUANTITIES])
+    problems, fixes = zip(*map(what_and_fix, shown.values()), strict=True)
+    fields = {"paths": tuple(shown), "problems": problems, "fixes": fixes}
+    return refused(Code.WRONG_QUANTITY, {"problem": "; ".join(shown.values()), **fields})
 
 
 # Words

@@ -26,6 +26,7 @@ from dxlrun.control.realtime_grants import (
     lockable_bytes,
     user,
 )
+from dxlrun.errors import what_and_fix
 from dxlwire.port.adapters import ONBOARD_PORTS, USB_PORTS, disturbances
 from dxlwire.port.latency_timer import fix, timer_ms
 from dxlwire.port.rights import command_for_access, serial_group
@@ -230,8 +231,7 @@ def _exchange(machine: Machine) -> CheckResult:
     )
     if not machine.compiled:
         return check.good("compiled")
-    what, _, how = machine.compiled.partition("; ")
-    return check.missing(what, how)
+    return check.missing(*what_and_fix(machine.compiled))
 
 
 def _ports(machine: Machine) -> Iterator[CheckResult]:

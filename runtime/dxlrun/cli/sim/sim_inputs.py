@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 from msgspec.structs import replace
 
 from dxlrun.description.document import read_file
-from dxlrun.errors import InputError, Mark, Problem
+from dxlrun.errors import InputError, Mark, Problem, what_and_fix
 
 if TYPE_CHECKING:
     from dxlsim.faults.fault import Fault
@@ -113,7 +113,6 @@ def _faults_of(file: Path) -> tuple[list[Fault], list[Problem]]:
         try:
             faults.append(parse_fault(line))
         except InputError as error:
-            what, _, fix = str(error).rpartition("; ")
             column = 1 + len(whole) - len(whole.lstrip())
-            problems.append(Problem(Mark(str(file), number, column), what, fix))
+            problems.append(Problem(Mark(str(file), number, column), *what_and_fix(error)))
     return faults, problems

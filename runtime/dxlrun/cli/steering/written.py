@@ -54,20 +54,18 @@ class WrittenEntry:
         """
         from dxlrun.channels.answers import Code
 
-        paths, problems = refused.fields.get("paths"), refused.fields.get("problems")
-        if (
-            refused.code != Code.WRONG_QUANTITY
-            or not isinstance(paths, list)
-            or not isinstance(problems, list)
-        ):
+        paths, problems, fixes = (refused.fields.get(name) for name in ("paths", "problems", "fixes"))
+        if refused.code != Code.WRONG_QUANTITY:
+            return refused
+        if not (isinstance(paths, list) and isinstance(problems, list) and isinstance(fixes, list)):
             return refused
         if self.in_words:
-            return Refused("\n".join(problems), code=refused.code, fields=refused.fields, wrong_input=True)
+            lines = [f"{what}; {fix}" for what, fix in zip(problems, fixes, strict=True)]
+            return Refused("\n".join(lines), code=refused.code, fields=refused.fields, wrong_input=True)
         found = []
-        for path, problem in zip(paths, problems, strict=True):
+        for path, what, fix in zip(paths, problems, fixes, strict=True):
             steps = [int(step) if step.isdecimal() else step for step in path.split("/")[1:]]
-            what, _, hint = problem.partition("; ")
-            found.append(Problem(self.grown.marks.value(*steps), what, hint))
+            found.append(Problem(self.grown.marks.value(*steps), what, fix))
         return InputError(found)
 
 

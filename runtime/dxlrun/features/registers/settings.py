@@ -13,7 +13,7 @@ from dxlrun.compile.joints.described_servos import DescribedServo, described_ser
 from dxlrun.compile.joints.register_values import UnfitRegister, any_value
 from dxlrun.compile.problems import RobotFile
 from dxlrun.description.reading import Description
-from dxlrun.errors import Mark, suggestion
+from dxlrun.errors import Mark, suggestion, what_and_fix
 from dxlrun.features.registers import servo_key
 from dxlwire.bus_plan import BusPlan, RegisterValue, ServoPlan
 from dxlwire.control_table import ControlItem, ControlTable
@@ -82,7 +82,7 @@ def compile_registers(
         except UnfitRegister as error:
             file.error(mark, f"{name}: {error.what}", error.fix)
         except ValueError as error:  # an invalid quantity
-            what, _, fix = str(error).partition("; ")
+            what, fix = what_and_fix(error)
             file.error(mark, f"{register} of {name}: {what}", fix)
     bus = file.robot.buses.get(servo.bus)
     delay = next((one.value for one in found if one.name == "return_delay_time"), None)

@@ -9,7 +9,7 @@ from pydantic import AfterValidator
 
 from dxlrun.description.base_form import Form, key, validation_error
 from dxlrun.description.other_files import read_yaml
-from dxlrun.errors import InputError
+from dxlrun.errors import InputError, what_and_fix
 from dxlrun.remote.sockets import Address
 
 
@@ -17,8 +17,7 @@ def _address(text: str) -> str:
     try:
         Address.parse(text, "robot")
     except InputError as error:
-        what, _, fix = str(error).partition("; ")
-        raise validation_error(what, fix) from error
+        raise validation_error(*what_and_fix(error)) from error
     return text
 
 
