@@ -1,4 +1,4 @@
-"""The verbs for a robot that runs, as a person types them, on one running torso; and steering.md."""
+"""The verbs for a robot that runs, typed into a torso on virtual time; and steering.md on a real run."""
 
 from __future__ import annotations
 
@@ -21,79 +21,61 @@ from tests.kit.commands import Case, cases, play
 from tests.kit.live_run import LiveRuns, Running
 from tests.kit.pages import page_text
 
-from dxlrun import DxlrunError, GoalState, GoalTimeout, RemoteRobot, connect, running
+from dxlrun import GoalState, GoalTimeout, RemoteRobot, connect, running
 from dxlrun.cli.verb_registry import GROUPS
-from dxlrun.remote.sockets import SocketLink
+from dxlrun.remote import client, sockets
+from dxlrun.testing import plan_of
+from dxlrun.tooling.runs import VirtualLink
 
 pytestmark = pytest.mark.long
 
 ROOT = Path(__file__).parents[2]
 PAGE = page_text("steering.md")
 TORSO = ROOT / "robots" / "bioloid_torso.yaml"
+NAME = "bioloid_torso"
+ACTIVE = {"joint_state_broadcaster", "head", "left_arm", "right_arm"}
 CODE = "import sys; from dxlrun.cli import main; sys.exit(main())"
 
 
-@pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveRuns]:
-    directory = tmp_path_factory.mktemp("run")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_RUNTIME_DIR", str(directory))
-        runs = LiveRuns(directory)
-        yield runs
-        runs.end()
+class Torso(VirtualLink):
+    """A torso on virtual time, to which every client is connected."""
+
+    def __init__(self, patch: pytest.MonkeyPatch) -> None:
+        super().__init__(plan_of(TORSO))
+        self.names, self.asked = [NAME], list[str]()
+        for module in (client, sockets):
+            patch.setattr(module, "sockets", lambda: dict.fromkeys(self.names) if self.alive else {})
+        patch.setattr(client, "SocketLink", self.connect)
+        self.robot = RemoteRobot(NAME, self)
+
+    def connect(self, _: object, name: str) -> Torso:
+        self._client = name.encode()
+        return self
+
+    def exchange(self, method: str, path: str, body: bytes | None) -> tuple[int, bytes]:
+        self.asked.append(f"{method} {path}")
+        return super().exchange(method, path, body)
+
+    def close(self) -> None:
+        """Leave the run to the other clients."""
+
+    def goal(self, joint: str) -> float:
+        """Return where a joint is sent a second later, rad."""
+        for _ in range(50):
+            self.run_cycle()
+        return float(self.robot.states().joint(joint)["goal_position"])
 
 
 @pytest.fixture
-def run(runs: LiveRuns) -> Running:
-    """The torso that runs; a new one after one that has ended."""
-    if not running():
-        runs.shared = runs.start("--duration", "300", "--no-record", robot=TORSO, gateway=True)
-        until(running, check=runs.shared.lives)
-    return runs.shared
+def torso(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Torso]:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    one = Torso(monkeypatch)
+    yield one
+    VirtualLink.close(one)
 
 
-@pytest.fixture
-def torso(run: Running) -> Iterator[RemoteRobot]:
-    """The torso as it is after its start."""
-    with connect(client="the test") as robot:
-        yield robot
-    if running() and run.process.poll() is None:
-        with connect(client="the test") as robot:
-            settle(robot)
-
-
-def settle(robot: RemoteRobot) -> None:
-    """Bring a torso back to where a test expects it."""
-    info = robot.info()
-    wanted = {"joint_state_broadcaster", "head", "left_arm", "right_arm"}
-    active = {name for name, one in controllers(robot).items() if one["active"]}
-    if active != wanted:
-        robot.switch(sorted(wanted - active), sorted(active - wanted))
-    for name in set(controllers(robot)) - wanted:
-        if name == "spare":
-            robot.unload(name)
-    if info["paused"]:
-        robot.resume()
-    if info["rate"] != 50:
-        robot.rate(50)
-
-
-def controllers(robot: RemoteRobot) -> dict[str, dict[str, object]]:
-    printed = robot.info()["controllers"]
-    assert isinstance(printed, list)
-    return {one["name"]: one for one in printed}
-
-
-def until_sent(robot: RemoteRobot, joint: str, goal: float) -> None:
-    """Wait until a joint is sent to `goal`, rad, within half a tick."""
-    near = pytest.approx(goal, abs=0.003)
-    until(lambda: robot.states().joint(joint)["goal_position"] == near, robot.states)
-
-
-# Looking
-
-
-def test_the_list_has_every_controller_and_what_it_takes(dxlrun, torso: RemoteRobot) -> None:
+def test_the_list_has_every_controller_and_what_it_takes(dxlrun, torso: Torso) -> None:
     said = dxlrun("list")
     assert (said.code, said.err) == (0, "")
     assert said.out.startswith("bioloid_torso: 50 Hz, ")
@@ -105,39 +87,24 @@ def test_the_list_has_every_controller_and_what_it_takes(dxlrun, torso: RemoteRo
         assert found, before
 
 
-def test_a_robot_that_has_ended_is_an_error(
-    dxlrun, torso: RemoteRobot, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def gone(robot: RemoteRobot) -> None:
-        raise DxlrunError(f"{robot.name} no longer answers")
-
-    monkeypatch.setattr(RemoteRobot, "info", gone)
-    assert dxlrun("list") == (1, "", "dxlrun: bioloid_torso no longer answers\n")
-
-
-# Steering
-
-
 @pytest.mark.parametrize("case", cases("steered.txt"))
-def test_what_is_typed_is_answered(
-    dxlrun, torso: RemoteRobot, case: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_what_is_typed_is_answered(dxlrun, torso: Torso, case: Case) -> None:
     play(case, dxlrun, commands.Stage())
 
 
-def test_send_moves_the_joints_that_are_named_with_units(dxlrun, torso: RemoteRobot) -> None:
+def test_send_moves_the_joints_that_are_named_with_units_by_one_request(dxlrun, torso: Torso) -> None:
     said = dxlrun("send", "head", "posvel", "positions=[20 deg, -30 deg]", "velocities=[1 rad/s, 30 rpm]")
     assert said == (0, "bioloid_torso: head accepted posvel\n", "")
-    until_sent(torso, "head_yaw_joint", -0.5236)
-    until_sent(torso, "head_pitch_joint", 0.3491)
+    assert torso.asked == ["POST /controllers/head/commands/posvel?units=true"]
+    goals = [torso.goal(joint) for joint in ("head_yaw_joint", "head_pitch_joint")]
+    assert goals == pytest.approx([-0.5236, 0.3491], abs=0.003)
 
 
-def test_python_follows_and_cancels_a_goal(torso: RemoteRobot) -> None:
-    goal = torso.send("left_arm", "position", {"left_elbow_joint": -0.3}, seconds=20.0).goal
+def test_python_follows_and_cancels_a_goal(torso: Torso) -> None:
+    goal = torso.robot.send("left_arm", "position", {"left_elbow_joint": -0.3}, seconds=20.0).goal
     assert goal is not None
-    with pytest.raises(GoalTimeout, match=f"goal {goal.number} of left_arm has not ended within 0.1 s"):
-        goal.wait(0.1)
+    with pytest.raises(GoalTimeout, match=f"goal {goal.number} of left_arm has not ended within 0 s"):
+        goal.wait(0.0)
     seen: list[GoalState] = []
 
     def feedback(state: GoalState) -> None:
@@ -147,27 +114,10 @@ def test_python_follows_and_cancels_a_goal(torso: RemoteRobot) -> None:
 
     assert goal.wait(20.0, feedback).status == "cancelled"
     assert 0.01 < seen[-1].progress < 0.5
-    assert torso.goals()[-1].number == goal.number
+    assert torso.robot.goals()[-1].number == goal.number
 
 
-def test_ctrl_c_at_a_terminal_that_waits_cancels_the_goal(torso: RemoteRobot) -> None:
-    words = ("send", "left_arm", "position", "left_elbow_joint=-20deg", "--in", "60s", "--wait")
-    before = len(torso.goals())
-    waiting = subprocess.Popen(
-        [sys.executable, "-P", "-c", CODE, *words], stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    )
-    until(lambda: len(torso.goals()) > before)
-    goal = torso.goals()[-1]
-    assert (goal.status, goal.controller) == ("running", "left_arm")
-    waiting.send_signal(signal.SIGINT)
-    out, err = waiting.communicate(timeout=DEADLINE_S)
-    assert (waiting.returncode, out) == (130, ""), err
-    assert f"goal {goal.number} of left_arm cancelled" in err
-    assert err.endswith("interrupted\n")
-    assert torso.goal_state(goal.number).status == "cancelled"
-
-
-def test_a_motion_is_played_into_a_robot_that_runs(dxlrun, torso: RemoteRobot, tmp_path: Path) -> None:
+def test_a_motion_is_played_into_a_robot_that_runs(dxlrun, torso: Torso, tmp_path: Path) -> None:
     file = tmp_path / "nod.yaml"
     file.write_text(
         "name: nod\nmotions:\n"
@@ -179,8 +129,8 @@ def test_a_motion_is_played_into_a_robot_that_runs(dxlrun, torso: RemoteRobot, t
     said = dxlrun("play", file, "--json")
     result = result_of(said.out)
     assert (said.code, result["status"], result["controller"]) == (0, "reached", "head")
-    until_sent(torso, "head_yaw_joint", 0.1745)
-    torso.switch(deactivate=["head"])
+    assert torso.goal("head_yaw_joint") == pytest.approx(0.1745, abs=0.003)
+    torso.robot.switch(deactivate=["head"])
     said = dxlrun("play", file)
     assert (said.code, said.errors) == (
         2,
@@ -188,56 +138,30 @@ def test_a_motion_is_played_into_a_robot_that_runs(dxlrun, torso: RemoteRobot, t
     )
 
 
-def test_a_command_is_one_request(dxlrun, torso: RemoteRobot, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[str] = []
-    exchange = SocketLink.exchange
-
-    def count(link: SocketLink, method: str, path: str, body: bytes | None) -> tuple[int, bytes]:
-        asked.append(f"{method} {path}")
-        return exchange(link, method, path, body)
-
-    monkeypatch.setattr(SocketLink, "exchange", count)
-    assert (
-        dxlrun("send", "head", "posvel", "positions=[0 deg, 0 deg]", "velocities=[1 rad/s, 1 rad/s]").code
-        == 0
-    )
-    assert dxlrun("switch", "--activate", "head", "--deactivate", "head").code == 0
-    assert asked == ["POST /controllers/head/commands/posvel?units=true", "POST /switch"]
-
-
-def test_a_refusal_has_its_code_and_its_fields_for_programs(dxlrun, torso: RemoteRobot) -> None:
+def test_a_refusal_has_its_code_and_its_fields_for_programs(dxlrun, torso: Torso) -> None:
     said = dxlrun("switch", "--activate", "head", "--json")
     (error,) = read_answer(said.out).errors
-    assert (said.code, error.what) == (1, "head is active already")
+    assert (said.code, error.what, torso.asked) == (1, "head is active already", ["POST /switch"])
     assert (error.code, error.fields) == ("active_already", {"controller": ["head"]})
 
 
-def test_of_several_robots_one_must_be_chosen(dxlrun, torso: RemoteRobot, run: Running) -> None:
-    sockets = run.directory / "dxlrun"
-    (sockets / "twin.sock").symlink_to(sockets / "bioloid_torso.sock")
-    try:
-        said = dxlrun("pause")
-        assert (said.code, said.err) == (
-            2, "dxlrun: several robots run; choose one: --robot bioloid_torso, --robot twin\n",
-        )  # fmt: skip
-        assert dxlrun("rate", "40", "--robot", "twin").out == "twin runs at 40 Hz\n"
-        assert dxlrun("list").out.count(": 40 Hz, ") == 2
-    finally:
-        (sockets / "twin.sock").unlink()
+def test_of_several_robots_one_must_be_chosen(dxlrun, torso: Torso) -> None:
+    torso.names.append("twin")
+    said = dxlrun("pause")
+    assert (said.code, said.err) == (
+        2, "dxlrun: several robots run; choose one: --robot bioloid_torso, --robot twin\n",
+    )  # fmt: skip
+    assert dxlrun("rate", "40", "--robot", "twin").out == "twin runs at 40 Hz\n"
+    assert dxlrun("list").out.count(": 40 Hz, ") == 2
 
 
-def test_the_log_names_the_command_of_the_terminal(dxlrun, torso: RemoteRobot) -> None:
-    last = torso.events()["last"]
+def test_the_log_names_the_command_of_the_terminal(dxlrun, torso: Torso) -> None:
     assert dxlrun("rate", "60").code == 0
-
-    texts = until(lambda: [one["text"] for one in torso.events(last)["events"] if one["name"] == "steered"])
-    assert len(texts) == 1
-    assert texts[0] == "rate 60 Hz from dxlrun rate"
+    texts = [one["text"] for one in torso.robot.events()["events"] if one["name"] == "steered"]
+    assert texts == ["rate 60 Hz from dxlrun rate"]
 
 
-def test_stop_waits_for_the_end_by_default(
-    dxlrun, torso: RemoteRobot, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_stop_waits_for_the_end_by_default(dxlrun, torso: Torso, monkeypatch: pytest.MonkeyPatch) -> None:
     waits: list[bool] = []
     monkeypatch.setattr(RemoteRobot, "stop", lambda robot, wait: waits.append(wait))
     assert dxlrun("stop").out == "bioloid_torso has ended\n"
@@ -245,58 +169,22 @@ def test_stop_waits_for_the_end_by_default(
     assert waits == [True, False]
 
 
-# The pages
-
-
-def test_the_script_of_the_page_steers_a_torso(torso: RemoteRobot, tmp_path: Path) -> None:
-    script = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)[0]
-    assert len(script.splitlines()) <= 30
-    printed = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=False, cwd=tmp_path
-    )
-    assert (printed.returncode, printed.stderr) == (0, "")
-    (shown,) = re.findall(r"It prints:\n\n```\n(.*?)```", PAGE, re.DOTALL)
-    assert printed.stdout == shown
-    assert torso.info()["rate"] == 40
-
-
-def test_the_policy_of_the_page_leads_an_arm(torso: RemoteRobot, tmp_path: Path) -> None:
-    text = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)[1]
-    (tmp_path / "policy.py").write_text(f"import time\n{text}")
-    program = runpy.run_path(str(tmp_path / "policy.py"))
-    elbow = torso.states().joints.index("left_elbow_joint")
-    began = torso.states().position[elbow]
-
-    program["follow"](
-        torso, lambda states: [[0.0, 0.0, began + 0.1 * step] for step in range(4)], seconds=0.2
-    )
-
-    assert torso.states().goal_position[elbow] != began
-
-
-@pytest.mark.skipif(shutil.which("curl") is None, reason="needs curl, which the page uses")
-def test_another_program_reads_the_robot_by_the_page(torso: RemoteRobot) -> None:
-    (line,) = re.findall(r"^    (curl .+)$", PAGE, re.MULTILINE)
-    printed = subprocess.run(["/bin/bash", "-c", f"{line} --silent"], capture_output=True, check=True)
-    assert json.loads(printed.stdout)["robot"] == torso.name
-
-
-def test_pose_that_is_printed_can_be_sent_and_looked_at(dxlrun, torso: RemoteRobot) -> None:
+def test_pose_that_is_printed_can_be_sent_and_looked_at(dxlrun, torso: Torso) -> None:
     said = dxlrun("get", "left_arm")
     assert (said.code, said.err) == (0, "")
     pose = said.out.split()
-    names = [word.partition("=")[0] for word in pose]
-    assert names == controllers(torso)["left_arm"]["joints"]
+    (arm,) = (one for one in torso.robot.info()["controllers"] if one["name"] == "left_arm")
+    assert [word.partition("=")[0] for word in pose] == arm["joints"]
     assert dxlrun("send", "left_arm", "position", *pose, "--in", "200ms", "--wait").code == 0
     assert dxlrun("frames", TORSO, "--of", "left_hand_link", "--at", *pose).code == 0
     found = result_of(dxlrun("get", "all", "--json").out)["pose"]
-    assert [*found] == list(torso.states().joints)
-    # The joint may still settle by a tick between the two requests.
-    now = torso.states().joint("left_elbow_joint")["position"]
-    assert found["left_elbow_joint"] == pytest.approx(now, abs=0.02)
+    states = torso.robot.states()
+    assert [*found] == list(states.joints)
+    assert found["left_elbow_joint"] == states.joint("left_elbow_joint")["position"]
 
 
-def test_every_command_of_a_running_robot_answers_in_one_form(dxlrun, torso: RemoteRobot) -> None:
+def test_every_command_of_a_running_robot_answers_in_one_form(dxlrun, torso: Torso) -> None:
+    """But `echo`, whose messages are live: tests/cli/test_echo.py."""
     lines = """list
         watch --once
         get head_yaw_joint
@@ -304,7 +192,6 @@ def test_every_command_of_a_running_robot_answers_in_one_form(dxlrun, torso: Rem
         parameters head
         send head position head_yaw_joint=0deg
         cancel
-        echo /joint_states --count 2
         rate 50
         play --list
         torque off left_elbow_joint --release
@@ -318,20 +205,99 @@ def test_every_command_of_a_running_robot_answers_in_one_form(dxlrun, torso: Rem
         resume
         take-over
         reboot left_elbow_joint
-        stop"""
+        stop --no-wait"""
     known = {"list", "watch", "play", "stop", *GROUPS["Robots that run"]}
-    assert {line.split()[0] for line in lines.splitlines()} == known
+    assert {line.split()[0] for line in lines.splitlines()} == known - {"echo"}
     for line in lines.splitlines():
         said = dxlrun(*shlex.split(line), "--json")
         for text in said.out.splitlines():
             answer = read_answer(text)
             assert (answer.ok, said.err) == (said.code == 0, ""), line
         assert said.code == (1 if line.split()[0] == "reboot" else 0), (line, said)  # Protocol 1.0
-    assert running() == ()
+
+
+# Real runs
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveRuns]:
+    directory = tmp_path_factory.mktemp("run")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_RUNTIME_DIR", str(directory))
+        runs = LiveRuns(directory)
+        yield runs
+        runs.end()
+
+
+@pytest.fixture
+def run(runs: LiveRuns) -> Iterator[Running]:
+    """A torso in its own processes; a new one after one that has ended."""
+    if not running():
+        runs.shared = runs.start("--duration", "3600", "--no-record", robot=TORSO, gateway=True)
+        until(running, check=runs.shared.lives)
+    yield runs.shared
+    if running() and runs.shared.process.poll() is None:
+        with connect(client="the test") as robot:
+            active = {one["name"] for one in robot.info()["controllers"] if one["active"]}
+            if active != ACTIVE:
+                robot.switch(sorted(ACTIVE - active), sorted(active - ACTIVE))
+
+
+def test_ctrl_c_at_a_terminal_that_waits_cancels_the_goal(run: Running) -> None:
+    words = ("send", "left_arm", "position", "left_elbow_joint=-20deg", "--in", "60s", "--wait")
+    with connect() as robot:
+        before = len(robot.goals())
+        waiting = subprocess.Popen(
+            [sys.executable, "-P", "-c", CODE, *words], stderr=subprocess.PIPE, stdout=subprocess.PIPE
+        )
+        until(lambda: len(robot.goals()) > before, check=run.lives)
+        goal = robot.goals()[-1]
+        assert (goal.status, goal.controller) == ("running", "left_arm")
+        waiting.send_signal(signal.SIGINT)
+        out, err = (text.decode() for text in waiting.communicate(timeout=DEADLINE_S))
+        assert (waiting.returncode, out) == (130, ""), err
+        assert f"goal {goal.number} of left_arm cancelled" in err
+        assert err.endswith("interrupted\n")
+        assert robot.goal_state(goal.number).status == "cancelled"
+
+
+def test_the_script_of_the_page_steers_a_torso(run: Running, tmp_path: Path) -> None:
+    script = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)[0]
+    assert len(script.splitlines()) <= 30
+    printed = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=False, cwd=tmp_path
+    )
+    assert (printed.returncode, printed.stderr) == (0, ""), run.lives()
+    (shown,) = re.findall(r"It prints:\n\n```\n(.*?)```", PAGE, re.DOTALL)
+    assert printed.stdout == shown
+    with connect() as robot:
+        assert robot.info()["rate"] == 40
+
+
+def test_the_policy_of_the_page_leads_an_arm(run: Running, tmp_path: Path) -> None:
+    text = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)[1]
+    (tmp_path / "policy.py").write_text(f"import time\n{text}")
+    program = runpy.run_path(str(tmp_path / "policy.py"))
+    with connect() as robot:
+        elbow = robot.states().joints.index("left_elbow_joint")
+        began = robot.states().position[elbow]
+
+        program["follow"](
+            robot, lambda states: [[0.0, 0.0, began + 0.1 * step] for step in range(4)], seconds=0.2
+        )
+
+        assert robot.states().goal_position[elbow] != began
+
+
+@pytest.mark.skipif(shutil.which("curl") is None, reason="needs curl, which the page uses")
+def test_another_program_reads_the_robot_by_the_page(run: Running) -> None:
+    (line,) = re.findall(r"^    (curl .+)$", PAGE, re.MULTILINE)
+    printed = subprocess.run(["/bin/bash", "-c", f"{line} --silent"], capture_output=True, check=True)
+    assert json.loads(printed.stdout)["robot"] == NAME
 
 
 def test_the_commands_of_the_page_work_in_their_order(
-    dxlrun, torso: RemoteRobot, run: Running, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    dxlrun, run: Running, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (name,) = re.findall(r"where `(.+?)` is", PAGE)
     (file,) = re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)

@@ -14,7 +14,6 @@ import msgspec
 import numpy as np
 import pytest
 from tests.kit.cases import read_head
-from tests.kit.driven import asgi_request
 
 import dxlrun
 from dxlrun.channels import heartbeat, mailbox, ring
@@ -34,6 +33,7 @@ from dxlrun.remote.job import Descriptors
 from dxlrun.remote.link import Link
 from dxlrun.remote.preparation import Preparation
 from dxlrun.remote.requests.replies import FRAME_LENGTH, Frame
+from dxlrun.remote.requests.request_table import Role
 from dxlrun.remote.server import serve_gateway
 from dxlrun.testing import plan_of
 
@@ -291,12 +291,44 @@ class Desk:
             data = data[end:]
         return found
 
-    async def request(self, method, path, body=b"", **options):
-        """Request something by ASGI; return status and content."""
-        if not isinstance(body, bytes):
-            body = json.dumps(body).encode()
-        status, self.headers, content = await asgi_request(self.app, method, path, body, **options)
-        return status, json.loads(content) if content else None
+    async def request(
+        self,
+        method,
+        path,
+        body=b"",
+        *,
+        headers=(),
+        chunks=None,
+        client=("process 1", Role.ADMIN),
+        heard=None,
+    ):
+        """Request something by ASGI; return status and content.
+
+        Args:
+            chunks: Messages that come from the client instead of a body.
+            heard: Gets a number for each message that is awaited.
+        """
+        body = body if isinstance(body, bytes) else json.dumps(body).encode()
+        coming = iter([{"type": "http.request", "body": body}] if chunks is None else chunks)
+        said = []
+
+        async def receive():
+            if heard is not None:
+                heard.append(1)
+            if (chunk := next(coming, None)) is None:
+                await asyncio.Event().wait()
+            return chunk
+
+        async def send(message):
+            said.append(message)
+
+        path, _, query = path.partition("?")
+        given = [(name.encode(), value) for name, value in headers]
+        scope = {"type": "http", "method": method, "path": path, "query_string": query.encode()}
+        await self.app({**scope, "headers": given, "client": client}, receive, send)
+        self.headers = dict(said[0]["headers"])
+        content = b"".join(message.get("body", b"") for message in said[1:])
+        return said[0]["status"], json.loads(content) if content else None
 
 
 @pytest.fixture

@@ -79,7 +79,7 @@ class VirtualRobot:
         log: Path | None = None,
         take_over: bool = False,
         ledger: Ledger | None = None,
-        watch: Callable[[RecordKind, Payload], None] = lambda kind, payload: None,
+        watch: Callable[[RecordKind, Payload], None] | None = None,
         kept: Path | None = None,
         inbox: Inbox | None = None,
     ) -> None:
@@ -114,7 +114,8 @@ class VirtualRobot:
                     self._writer.write_record(kind, payload)
                     if kind == RecordKind.CYCLE and isinstance(self._writer, PartWriter):
                         self._writer.split_if_due()
-                watch(kind, payload)
+                if watch:
+                    watch(kind, payload)
                 if self._kept:
                     self._kept.process_record(kind, payload)
 
@@ -126,7 +127,7 @@ class VirtualRobot:
                 PacketBatch(to_log) if log else PacketLog(),
                 self._events,
                 CommandRing(to_log) if log else NoCommands(),
-                messages=MessageRing(to_log) if log or kept else MessageSink(),
+                messages=MessageRing(to_log) if log or kept or watch else MessageSink(),
             )
             host = LoopHost(
                 ports=VirtualPorts(self.clock, self.buses),
