@@ -9,18 +9,20 @@ The texts have the form of `tests/kit/cases.py`. The head is a robot file, or a 
       play                             the motion of this text, one of `robots/motions`, or a name
       jam servo=2 at=500ms             a fault, as `dxlrun --fault` has it
       hand servo=2 by=-30 at=1300ms    a hand turns a shaft by degrees at once, against the servo
+      mute servo=2 at=500ms for=60ms   replies are lost, while the servo executes its instructions
       at 0.2 arm trajectory {points: [{time: 1, positions: [0.7, 0]}]}
       at 0.9 cancel {controller: arm}
       => goal arm missed joint grip is...
       => shaft 2 at 2.9: 10 to 20 deg
 
-Expected are each goal that ends, events (`=> event arm turns...`, `=> no event ...`; `any` is each source),
-shafts, deg from the reference, and columns of the log: `=> position elbow from 1.5 to 2: 0.29 to 0.31`, with
-`spread` before the numbers for the difference of the largest and the smallest one, and `step` for the largest
-one of neighbours. Without a time it is the last cycle. `=> topic /pid/state: 0 to 30` is about the ms between
-its messages. `=> wrote 1 led: 1 0` has the values that a servo was sent, by the ledger. `...` stands for any
-text. Each run is equal to its replay. `needs physics` names an extra. A case may have several runs: by
-`NAME = a | b` its `NAME` stands for one text after the other.
+Expected are each goal that ends, events (`=> event arm turns...`, `=> no event ...`; `any` is each source;
+`=> times 4 arm turns...` counts them), shafts, deg from the reference, and columns of the log: `=> position
+elbow from 1.5 to 2: 0.29 to 0.31`, with `spread` before the numbers for the difference of the largest and the
+smallest one, and `step` for the largest one of neighbours. Without a time it is the last cycle. `=> topic
+/pid/state: 0 to 30` is about the ms between its messages, `=> lasts 1.5 to 2 s` about the whole run. `=>
+wrote 1 led: 1 0` has the values that a servo was sent, by the ledger. `...` stands for any text. Each run is
+equal to its replay. `needs physics` names an extra. A case may have several runs: by `NAME = a | b` its
+`NAME` stands for one text after the other.
 """
 
 from __future__ import annotations
@@ -38,7 +40,7 @@ import pytest
 import yaml
 from tests.kit.cases import Line, TextCase, read_cases
 from tests.kit.clients import Ask, clients_of
-from tests.kit.line_faults import turn_by_hand
+from tests.kit.line_faults import lose_replies, turn_by_hand
 from tests.kit.wire import all_writes
 
 from dxlrun.channels.answers import Completion
@@ -69,6 +71,7 @@ class Story:
         self.seconds, self.arguments = 0.0, dict[str, str]()
         self.play, self.asks, self.faults = list[Path | str](), list[Ask](), list[Any]()
         self.hands: list[tuple[int, float, int]] = []
+        self.mute: list[tuple[int, ...]] = []
         self.goals: list[dict[str, Any]] = []
         self.shafts: dict[int, list[float]] = {number: [] for number in shafts}
 
@@ -92,6 +95,10 @@ class Story:
             assert match, "write hand servo=ID by=DEGREES at=TIMEms"
             servo, by, ms = match.groups()
             self.hands.append((int(servo), math.radians(float(by)), int(ms) * 1_000_000))
+        elif word == "mute":
+            match = re.fullmatch(r"servo=(\d+) at=(\d+)ms for=(\d+)ms", rest)
+            assert match, "write mute servo=ID at=TIMEms for=TIMEms"
+            self.mute.append(tuple(map(int, match.groups())))
         elif word in KINDS:
             self.faults.append(parse_fault(line))
         else:
@@ -116,6 +123,8 @@ class Story:
         for number, by, at_ns in self.hands:
             servo = robot.buses[0].servo(number)
             robot.buses[0].at(at_ns, partial(self._turn, servo, by))
+        for number, at_ms, for_ms in self.mute:
+            lose_replies(robot.buses[0], number, at_ms * 1_000_000, (at_ms + for_ms) * 1_000_000)
         self._watch(robot)
         self.result, self.virtual = robot.run(), robot
         assert all(isinstance(answer, Completion) for answer in client.answers.values()), client.answers
@@ -146,14 +155,19 @@ class Story:
             self.goals.remove(goal)
             assert goal["status"] == status, goal
             assert not text or matches(goal["text"], text[0]), goal
-        elif word in ("event", "no"):
-            source, _, text = rest.removeprefix("event ").partition(" ")
+        elif word in ("event", "no", "times"):
+            count, rest = rest.split(" ", 1) if word == "times" else ("", rest.removeprefix("event "))
+            source, _, text = rest.partition(" ")
             texts = [
                 event.text
                 for event in self.log.events
                 if source == "any" or event.source in (source, "runtime")
             ]
-            assert any(matches(one, text) for one in texts) == (word == "event"), texts
+            found = sum(matches(one, text) for one in texts)
+            assert found == int(count) if count else bool(found) == (word == "event"), texts
+        elif word == "lasts":
+            least, most = map(float, rest.removesuffix(" s").split(" to "))
+            assert least <= (lasted := self.virtual.clock.now_ns() * 1e-9) <= most, lasted
         elif word == "wrote":
             servo, _, rest = rest.partition(" ")
             item, _, values = rest.partition(": ")
