@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Generator, Iterator, Mapping
 from dataclasses import dataclass
-from enum import Enum, auto, unique
-from typing import Annotated, ClassVar, Final, Literal
+from functools import lru_cache
+from typing import Annotated, ClassVar, Final, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,28 +34,20 @@ from dxlrun import (
     ParametersModel,
     RobotModel,
 )
-from dxlrun.tooling.robots import FrameTree, Urdf, read_urdf
-from dxlrun_space.chain import BASE, IDENTITY, Chain, Pose, Rotation, Vector, WrongChain, rotation_of
-from dxlrun_space.path import (
-    MotionLimits,
-    NoPath,
-    Path,
-    Planning,
-    Positions,
-    plan_joints,
-    plan_line,
-    shifted,
-)
+from dxlrun.tooling.robots import read_urdf
+from dxlrun_space.arm_frames import ArmFrames
+from dxlrun_space.chain import BASE, IDENTITY, Chain, Pose, Vector, WrongChain, turned
+from dxlrun_space.path import MotionLimits, NoPath, Path, Planning, Positions, plan_joints, plan_line, shifted
 from dxlrun_space.solver import FULL, Solution, Solver, distance, residual_of
 from dxlrun_space.space_goals import (
+    POSES,
+    TWISTS,
     PoseCommand,
     PoseGoal,
     TwistCommand,
-    flat_pose,
-    flat_twist,
-    in_axes,
-    read_pose,
-    read_twist,
+    TwistGoal,
+    packed,
+    unpacked,
 )
 from dxlrun_space.stream import TwistMotion, approach
 
@@ -73,6 +65,10 @@ LEASH_M: Final = 0.02
 """Longest distance of the pose that moves toward a leader from what is in reach, m: the way back is short."""
 _LONGEST_STOP_S: Final = 2.0
 _ZERO: Final[Vector] = (0.0, 0.0, 0.0)
+Twist: TypeAlias = "tuple[Vector, Vector]"
+NO_TWIST: Final[Twist] = (_ZERO, _ZERO)
+Task: TypeAlias = "Generator[None, None, None]"
+"""Motion or planning that advances by a cycle with each `next`."""
 
 
 class TranslationLimits(ParametersModel):
@@ -125,7 +121,8 @@ class CartesianParameters(ParametersModel):
     posture: Mapping[str, Angle] = {}
     """Positions by joint to which the arm tends where a pose leaves a choice. By default it turns little."""
     timeout: Annotated[Duration, Field(gt=0)] = 200_000_000
-    """Longest age of a twist, or of a leader's state. The tip brakes if it is older."""
+    """Longest age of a twist, or of the state of a joint that leads or moves a `frame`. The tip brakes if a
+    twist or a leader's state is older."""
     leader: LeaderParameters | None = None
     """Arm whose tip is followed. Poses and twists are refused then."""
 
@@ -157,16 +154,6 @@ class PosePlan:
     """Reason for no motion, or the part of the pose that is not reached."""
 
 
-@unique
-class _Phase(Enum):
-    RESTING = auto()
-    PLANNING = auto()
-    MOVING = auto()
-    STOPPING = auto()
-    """The tip brakes on its path, or from its twist; then a waiting goal begins."""
-    STREAMING = auto()
-
-
 class CartesianController(Controller[CartesianParameters]):
     """Controller that moves a link to poses in space, one goal at a time, or at the twists of a stream.
 
@@ -182,14 +169,13 @@ class CartesianController(Controller[CartesianParameters]):
 
     @classmethod
     def interfaces(cls, parameters: CartesianParameters, joints: tuple[str, ...]) -> Interfaces:
-        """Command positions; read the positions of all other joints, for frames that these move, or the
-        positions and ages of the leader's joints.
+        """Command positions; read positions and ages of the leader's joints, or of all other joints, for the
+        frames that these move.
         """
-        if (leader := parameters.leader) is not None:
-            reads = [f"{joint}/{state}" for state in ("position", "age") for joint in leader.joints]
-            return Interfaces(parameters.joints, ("position",), reads=tuple(reads))
-        others = tuple(f"{joint}/position" for joint in joints if joint not in parameters.joints)
-        return Interfaces(parameters.joints, ("position",), reads=others)
+        leader = parameters.leader
+        others = leader.joints if leader else [joint for joint in joints if joint not in parameters.joints]
+        reads = tuple(f"{joint}/{state}" for state in ("position", "age") for joint in others)
+        return Interfaces(parameters.joints, ("position",), reads=reads, optional=() if leader else reads)
 
     @classmethod
     def mismatches(cls, parameters: CartesianParameters, robot: RobotModel) -> Iterator[Mismatch]:
@@ -197,13 +183,18 @@ class CartesianController(Controller[CartesianParameters]):
         if robot.urdf is None:
             yield Mismatch("needs a URDF, but the robot file names none", "write `model: {urdf: NAME.urdf}`")
             return
-        place = ""
+        place, own = "", (*robot.joints, *robot.others)
         try:
             urdf = read_urdf(robot.urdf)
-            Chain(urdf, parameters.base, parameters.tip, parameters.joints)
-            if (leader := parameters.leader) is not None:
-                place = "leader."
-                Chain(urdf, leader.base, leader.tip, leader.joints)
+            for place, one in (("", parameters), ("leader.", parameters.leader)):
+                if one is None:
+                    continue
+                moving = Chain(urdf, one.base, one.tip).joints
+                if lacking := next((joint for joint in moving if joint not in own), ""):
+                    what = f"needs joint {lacking}, which is omitted or has no servo, to move {one.tip}"
+                    yield Mismatch(what, f"remove the controller, or run with {lacking}", f"{place}tip")
+                    return
+                Chain(urdf, one.base, one.tip, one.joints)
             for name, unit in zip(robot.joints, robot.units, strict=True):
                 joint = urdf.joint(name)
                 if joint is not None and (joint.type == "prismatic") != (unit is LINEAR):
@@ -221,11 +212,17 @@ class CartesianController(Controller[CartesianParameters]):
         """Return a pose or a twist as one flat array. Raises ValueError if the tip follows a leader."""
         if parameters.leader is not None:
             raise ValueError(f"the tip follows a leader; a {kind} is not accepted")
-        if isinstance(command, PoseCommand):
-            return flat_pose(command)
-        if isinstance(command, TwistCommand):
-            return flat_twist(command)
+        if isinstance(command, PoseCommand | TwistCommand):
+            return packed(command.as_goal)
         return super().prepare(kind, command, parameters)
+
+    @classmethod
+    def check_command(
+        cls, kind: str, command: CommandModel, parameters: CartesianParameters, robot: RobotModel
+    ) -> None:
+        """Raise ValueError for a frame that the robot does not have, or that an omitted joint moves."""
+        if isinstance(command, PoseCommand | TwistCommand) and command.frame and robot.urdf:
+            _frames(robot.urdf, parameters.base, (*robot.joints, *robot.others)).movers(command.frame)
 
     def on_configure(self, context: Context) -> None:
         """Build the chain, and everything that the loop needs."""
@@ -233,13 +230,13 @@ class CartesianController(Controller[CartesianParameters]):
         parameters, limits = self.parameters, context.limits
         if context.urdf is None:
             raise ValueError("no URDF; write `model: {urdf: NAME.urdf}`")
-        urdf = read_urdf(context.urdf)
+        urdf, leader = read_urdf(context.urdf), parameters.leader
         self._chain = Chain(urdf, parameters.base, parameters.tip, context.joints)
-        self._frames = _frames(urdf, context)
-        self._leader: Chain | None = None
-        if (leader := parameters.leader) is not None:
-            self._leader = Chain(urdf, leader.base, leader.tip, leader.joints)
-            self._leader_position, self._leader_age = context.reads.reshape(2, -1)
+        self._leader = None if leader is None else Chain(urdf, leader.base, leader.tip, leader.joints)
+        self._others = [name.partition("/")[0] for name in context.read_names[: len(context.reads) // 2]]
+        self._position, self._age = context.reads.reshape(2, -1)
+        """Positions and ages of the leader's joints, or of the others."""
+        self._frames = ArmFrames(urdf, parameters.base, (*context.joints, *self._others))
         lower, upper = limits.lower.tolist(), limits.upper.tolist()
         self._limits = MotionLimits(
             tuple(np.where(np.isnan(limits.velocity), SPEED, limits.velocity).tolist()),
@@ -258,33 +255,27 @@ class CartesianController(Controller[CartesianParameters]):
         self._steps = min(MOST_STEPS, max(1, context.period_ns // STEP_NS))
         self._at: Positions = ()
         """Commanded positions, rad; empty while a joint has not answered yet."""
+        self._now_ns, self._period_s = 0, context.period_ns * 1e-9
         self._forget()
 
     def _forget(self) -> None:
-        self._phase = _Phase.RESTING
+        self._task: Task | None = None
+        self._moves = self._brakes = False
         self._goal: Goal | None = None
-        self._is_trial = False
-        """True while a motion is planned to be published, and not to be made."""
         self._waiting: PoseGoal | None = None
-        self._ending: Outcome | None = None
-        """Outcome of the goal once the tip rests; None: another goal begins then."""
-        self._asked: PoseGoal | None = None
-        self._target: Pose = BASE
-        self._planning: Planning | None = None
-        self._path: Path | None = None
-        self._passed_s = self._rate = self._slope = 0.0
-        self._stretch = 1.0
-        self._start_ns = self._feedback_ns = self._commanded_ns = 0
-        self._twist = _ZERO, _ZERO
+        self._is_cancelled = False
+        self._target: Pose | None = None
+        self._feedback_ns = self._commanded_ns = 0
+        self._twist = NO_TWIST
         self._turns_with_tip = False
-        self._said_held = False
+        self._is_held = self._is_ignoring = False
         self._followed: Pose | None = None
         """Pose that moves toward the leader's, and that the tip has."""
+        self._stream.drop_twist()
 
     def on_activate(self, time_ns: int) -> None:
         """Hold the joints at their last goals."""
         self._forget()
-        self._stream.drop_twist()
         self._hold_joints()
         self._write()
 
@@ -306,8 +297,7 @@ class CartesianController(Controller[CartesianParameters]):
 
     def on_goal(self, goal: Goal, data: NDArray[np.float64], time_ns: int) -> None:
         """Plan a motion to the pose; a motion that is under way brakes first."""
-        self._goal, self._start_ns, self._feedback_ns = goal, time_ns, time_ns + FEEDBACK_NS
-        self._ending, self._is_trial = None, False
+        self._goal, self._is_cancelled, self._feedback_ns = goal, False, time_ns + FEEDBACK_NS
         if not self._at:
             self._hold_joints()
         if not self._at:
@@ -315,257 +305,228 @@ class CartesianController(Controller[CartesianParameters]):
             joint = self.context.joints[int(unknown.argmax())]
             self._end(Outcome.ABORTED, f"joint {joint} has not answered yet")
             return
-        self._waiting = read_pose(data)
-        if self._phase in (_Phase.MOVING, _Phase.STREAMING):
-            self._brake()
-        elif self._phase is not _Phase.STOPPING:
-            self._plan()
+        self._pass_to(unpacked(data, POSES))
 
     def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
         """Follow a twist; a pose that is under way ends as preempted. Or plan without moving."""
         if not self._at:
             self._hold_joints()
-        if kind == "plan":
-            self._try_plan(read_pose(data))
+        if kind == "twist":
+            self._follow(unpacked(data, TWISTS), time_ns)
+        elif self._moves or self._goal is not None:
+            self._publish(NoPath("the arm moves; ask again when it rests"))
+        else:
+            self._task = self._try(unpacked(data, POSES))
+
+    def _follow(self, twist: TwistGoal, time_ns: int) -> None:
+        self._turns_with_tip = twist.frame == self._chain.tip
+        try:
+            rotation = IDENTITY if self._turns_with_tip else self._pose_of(twist.frame)[0]
+        except ValueError as error:
+            if not self._is_ignoring:
+                self.context.warn(f"twist ignored: {error}")
+            self._is_ignoring, self._twist = True, NO_TWIST
             return
-        self._is_trial = False
-        linear, angular, frame = read_twist(data)
-        self._turns_with_tip = frame == self._chain.tip
-        rotation: Rotation = IDENTITY
-        if not self._turns_with_tip:
-            found = self._pose_of(frame)
-            if isinstance(found, str):
-                self.context.warn(f"twist ignored: {found}")
-                return
-            rotation = found[0]
-        self._twist = in_axes(rotation, linear, angular)
-        self._commanded_ns = time_ns
+        self._is_ignoring, self._commanded_ns = False, time_ns
         if self._goal is not None:
             self._end(Outcome.PREEMPTED, "replaced by a twist")
-        self._waiting = self._planning = None
-        if self._phase is _Phase.MOVING:
-            self._ending = None
-            self._brake()
-        elif self._phase is not _Phase.STOPPING:
-            self._phase = _Phase.STREAMING
-
-    def _try_plan(self, asked: PoseGoal) -> None:
-        """Plan a motion from rest to a pose, and publish it."""
-        if self._phase is _Phase.RESTING or self._is_trial:
-            self._is_trial, self._waiting = True, asked
-            self._plan()
-        else:
-            self._publish("the arm moves; ask again when it rests")
-
-    def _publish(self, text: str, path: Path | None = None) -> None:
-        self._is_trial = False
-        x, y, z = self._target[1]
-        last = [math.nan] * len(self.context.joints) if path is None else path.last
-        duration = math.nan if path is None else path.duration_s
-        self.context.publish("plan", PosePlan(x, y, z, np.array(last), duration, text))
+        self._pass_to(None, (turned(rotation, twist.linear), turned(rotation, twist.angular)))
 
     def on_hold(self, time_ns: int) -> None:
         """Brake from the twist: the stream has ended."""
-        self._twist = _ZERO, _ZERO
+        self._twist = NO_TWIST
         self._write()
 
     def on_cancel(self, goal: Goal, time_ns: int) -> None:
         """Brake on the path; the goal ends when the tip rests."""
-        self._waiting = self._planning = None
-        self._ending = Outcome.CANCELLED
-        if self._phase in (_Phase.MOVING, _Phase.STREAMING):
-            self._brake()
-        elif self._phase is not _Phase.STOPPING:
-            self._come_to_rest()
+        self._is_cancelled = True
+        self._pass_to(None)
 
-    def _end(self, outcome: Outcome, text: str, joint: str = "") -> None:
+    def _pass_to(self, pose: PoseGoal | None, twist: Twist = NO_TWIST) -> None:
+        """Brake on the path, then pursue a pose or a twist; at once if the tip rests."""
+        self._waiting, self._twist, self._brakes = pose, twist, True
+        if not self._moves:
+            self._begin_task()
+
+    def _begin_task(self) -> None:
+        """Begin what waits, from rest."""
+        self._task, self._moves, self._brakes = None, False, False
+        if self._is_cancelled:
+            self._is_cancelled = False
+            self._end(Outcome.CANCELLED)
+        elif self._waiting is not None:
+            self._task, self._waiting = self._pursue(self._waiting), None
+        elif any(map(any, self._twist)):
+            self._task, self._moves = self._stream_twists(), True
+
+    def _end(self, outcome: Outcome, text: str = "") -> None:
         goal, self._goal = self._goal, None
         if goal is not None:
-            goal.end(outcome, text, joint)
-        elif self._is_trial:
-            self._publish(text)
+            goal.end(outcome, text)
 
-    def _plan(self) -> None:
-        """Begin to plan a motion from rest to the waiting goal."""
-        asked, self._waiting = self._waiting, None
-        self._phase = _Phase.RESTING
-        if asked is None:
-            return
-        frame = self._pose_of(asked.frame)
-        if isinstance(frame, str):
-            self._end(Outcome.ABORTED, frame)
-            return
-        self._asked, self._target = asked, asked.target(frame, self._chain.pose(self._at))
-        plan = plan_line if asked.by_line else plan_joints
-        exact = self._exact and asked.asks_orientation
-        self._planning = plan(self._solver, self._at, self._target, self._limits, exact=exact)
-        self._phase = _Phase.PLANNING
-
-    def _pose_of(self, frame: str) -> Pose | str:
-        """Return the pose of a frame in the base, or why it is not known."""
+    def _pose_of(self, frame: str) -> Pose:
+        """Return the pose of a frame in the base. Raises ValueError with the joint that prevents it."""
         if not frame:
             return BASE
-        positions = dict(zip(self.context.joints, self._at, strict=False))
-        for name, value in zip(self.context.read_names, self.context.reads.tolist(), strict=True):
-            positions[name.removesuffix("/position")] = value
-        try:
-            pose = self._frames.pose(
-                frame,
-                self._chain.base,
-                {name: value for name, value in positions.items() if name in self._frames.moved},
-            )
-        except LookupError as error:
-            return str(error.args[0])
-        except ValueError:
-            return f"the pose of {frame} is not known; a joint has not answered yet"
-        return rotation_of(pose.rotation), pose.translation
+        positions: dict[str, float] = {}
+        for joint in self._frames.movers(frame):
+            if joint in self.context.joints:
+                positions[joint] = self._at[self.context.joints.index(joint)]
+                continue
+            index = self._others.index(joint)
+            if silence := self._silence(index):
+                raise ValueError(f"no reply from {joint} {silence}, which moves frame {frame}")
+            positions[joint] = float(self._position[index])
+        return self._frames.pose(frame, positions)
+
+    def _silence(self, index: int) -> str:
+        """Return for how long a joint that is read has not answered; empty if it answers."""
+        age_s = float(self._age[index])
+        if age_s <= self.parameters.timeout * 1e-9:
+            return ""
+        return "yet" if math.isnan(age_s) else f"for {age_s:.2f} s"
 
     # In a cycle
 
     def update(self, time_ns: int, period_ns: int) -> None:
         """Advance planning, path or twist by a period, and command the positions."""
+        self._now_ns, self._period_s = time_ns, period_ns * 1e-9
         if not self._at:
             self._hold_joints()
-        elif self.context.states.has_lost and (self._leader or self._phase is not _Phase.RESTING):
+        elif self.context.states.has_lost and (self._leader or self._task):
             self._abandon()
         elif self._leader is not None:
-            self._follow_leader(self._leader, period_ns * 1e-9)
-        elif self._phase is _Phase.PLANNING:
-            self._advance_plan()
-        elif self._phase is _Phase.STREAMING or (self._phase is _Phase.STOPPING and self._path is None):
-            self._follow(time_ns, period_ns * 1e-9)
-        elif self._phase in (_Phase.MOVING, _Phase.STOPPING):
-            self._move(time_ns, period_ns * 1e-9)
+            self._follow_leader(self._leader)
+        elif self._task is not None and next(self._task, True):
+            self._begin_task()
         self._write()
 
     def _abandon(self) -> None:
-        """End everything where the joints were sent: a joint is lost, and the runtime holds the others."""
+        """Hold the goals that were sent: a joint is lost, and the runtime holds the others."""
         self._hold_joints()
-        self._stream.drop_twist()
         text = ""
-        if self._asked is not None and self._at:
+        if self._target is not None and self._at:
             left = residual_of(self._chain.pose(self._at), self._target)
             text = f"held {left.position * 1e3:.0f} mm before the pose"
         self._end(Outcome.ABORTED, text)
         self._forget()
 
-    def _advance_plan(self) -> None:
-        planning, asked = self._planning, self._asked
-        if planning is None or asked is None:
-            self._phase = _Phase.RESTING
-            return
-        for _ in range(self._steps):
-            try:
-                next(planning)
-            except StopIteration as done:
-                self._begin(done.value, asked)
-                return
-
-    def _begin(self, found: Path | NoPath, asked: PoseGoal) -> None:
-        """Begin the motion that was planned, or end the goal with the reason why there is none."""
-        self._planning, self._phase = None, _Phase.RESTING
-        if isinstance(found, NoPath):
-            self._end(Outcome.ABORTED, found.text)
-            return
-        if asked.seconds < found.duration_s:
+    def _planned(self, asked: PoseGoal) -> Planning:
+        """Plan a motion from rest, some steps in each cycle."""
+        try:
+            frame = self._pose_of(asked.frame)
+        except ValueError as error:
+            return NoPath(str(error))
+        self._target = asked.target(frame, self._chain.pose(self._at))
+        plan = plan_line if asked.by_line else plan_joints
+        exact = self._exact and asked.asks_orientation
+        planning = plan(self._solver, self._at, self._target, self._limits, exact=exact)
+        found: Path | NoPath | None = None
+        while found is None:
+            for _ in range(self._steps):
+                try:
+                    next(planning)
+                except StopIteration as done:
+                    found = done.value
+                    break
+            else:
+                yield
+        if isinstance(found, Path) and asked.seconds < found.duration_s:
             needed = math.ceil(found.duration_s * 100) / 100
-            self._end(
-                Outcome.ABORTED,
-                f"the motion takes {needed:.2f} s within its limits; ask for at least this time",
-            )
-            return
-        if self._is_trial:
-            self._publish(_remark(found, asked), found)
-            return
-        self._stretch = 1.0
-        if found.duration_s > 0 and not math.isnan(asked.seconds):
-            self._stretch = found.duration_s / asked.seconds
-        self._path, self._passed_s, self._rate, self._slope = found, 0.0, 1.0, 0.0
-        self._phase = _Phase.MOVING
+            return NoPath(f"the motion takes {needed:.2f} s within its limits; ask for at least this time")
+        return found
 
-    def _move(self, time_ns: int, period_s: float) -> None:
-        """Advance on the path; its time passes more slowly while the tip brakes."""
-        path = self._path
-        if path is None:
-            self._come_to_rest()
-            return
-        before, self._rate = self._rate, max(0.0, self._rate - self._slope * period_s)
-        self._passed_s += (before + self._rate) / 2 * self._stretch * period_s
-        self._at = path.sample(self._passed_s).positions
-        if self._phase is _Phase.STOPPING:
-            if self._rate == 0.0 or self._passed_s >= path.duration_s:
-                self._come_to_rest()
-        elif self._passed_s >= path.duration_s:
-            self._arrive(path)
-        elif time_ns >= self._feedback_ns and self._goal is not None:
-            self._feedback_ns = time_ns + FEEDBACK_NS
-            error = float(np.abs(self.context.states.position - self._at).max())
-            self._goal.feedback(self._passed_s / path.duration_s, error)
+    def _try(self, asked: PoseGoal) -> Task:
+        """Plan a motion from rest to a pose, and publish it."""
+        found = yield from self._planned(asked)
+        self._publish(found, "" if isinstance(found, NoPath) else _remark(found, asked))
 
-    def _arrive(self, path: Path) -> None:
-        """Let the runtime judge the goal by the joints at the end of the path."""
-        self._path, self._phase = None, _Phase.RESTING
-        goal, self._goal = self._goal, None
-        if goal is None:
-            return
-        goal.judge(np.array(path.last), text="" if self._asked is None else _remark(path, self._asked))
-
-    def _brake(self) -> None:
-        """Slow down on the path, as fast as the joints may brake, or from the twist."""
-        if self._phase is _Phase.MOVING and self._path is not None:
-            speeds = self._path.sample(self._passed_s).velocities
-            rates = [
-                most / max(abs(speed) * self._stretch, 1e-9)
-                for speed, most in zip(speeds, self._limits.acceleration, strict=True)
-            ]
-            # Half of the acceleration, because the path's own curvature needs the rest.
-            self._slope = max(min(rates) / 2, 1 / _LONGEST_STOP_S)
+    def _publish(self, found: Path | NoPath, text: str = "") -> None:
+        x, y, z = (self._target or BASE)[1]
+        last, seconds = (math.nan,) * len(self.context.joints), math.nan
+        if isinstance(found, NoPath):
+            text = found.text
         else:
-            self._path, self._twist = None, (_ZERO, _ZERO)
-        self._phase = _Phase.STOPPING
+            last, seconds = found.last, found.duration_s
+        self.context.publish("plan", PosePlan(x, y, z, np.array(last), seconds, text))
 
-    def _come_to_rest(self) -> None:
-        self._path, self._phase = None, _Phase.RESTING
-        if self._ending is not None:
-            outcome, self._ending = self._ending, None
-            self._end(outcome, "")
-        elif self._waiting is not None:
-            self._plan()
-        elif any(map(any, self._twist)):
-            self._phase = _Phase.STREAMING
+    def _pursue(self, asked: PoseGoal) -> Task:
+        """Plan a motion to a pose, make it, and let the runtime judge the goal at the end of the path.
 
-    def _follow(self, time_ns: int, period_s: float) -> None:
-        """Move at the twist, or brake from it."""
-        if time_ns - self._commanded_ns > self.parameters.timeout:
-            self._twist = _ZERO, _ZERO
-        linear, angular = self._twist
-        if self._turns_with_tip:
-            linear, angular = in_axes(self._chain.pose(self._at)[0], linear, angular)
-        self._at = self._stream.advance_joints(self._at, linear, angular, period_s)
-        held = self._stream.held_by
-        if held >= 0 and not self._said_held:
-            self.context.say(f"held: joint {self.context.joints[held]} is at its limit")
-        self._said_held = held >= 0
-        if self._stream.rests and not (any(linear) or any(angular)):
-            self._come_to_rest()
+        The time of the path passes more slowly while the tip brakes.
+        """
+        path = yield from self._planned(asked)
+        if isinstance(path, NoPath):
+            self._end(Outcome.ABORTED, path.text)
+            return
+        yield
+        stretch, passed_s, rate, slope = 1.0, 0.0, 1.0, 0.0
+        if path.duration_s > 0 and not math.isnan(asked.seconds):
+            stretch = path.duration_s / asked.seconds
+        self._moves = True
+        while True:
+            if self._brakes and not slope:
+                slope = self._braking(path.sample(passed_s).velocities, stretch)
+            before, rate = rate, max(0.0, rate - slope * self._period_s)
+            passed_s += (before + rate) / 2 * stretch * self._period_s
+            self._at = path.sample(passed_s).positions
+            if rate == 0.0 or passed_s >= path.duration_s:
+                break
+            if self._goal is not None and not slope and self._now_ns >= self._feedback_ns:
+                self._feedback_ns = self._now_ns + FEEDBACK_NS
+                error = float(np.abs(self.context.states.position - self._at).max())
+                self._goal.feedback(passed_s / path.duration_s, error)
+            yield
+        goal = self._goal
+        if goal is not None and not slope:
+            self._goal = None
+            goal.judge(np.array(path.last), text=_remark(path, asked))
 
-    def _follow_leader(self, chain: Chain, period_s: float) -> None:
+    def _braking(self, velocities: Positions, stretch: float) -> float:
+        """Return the change of the path's rate with which the joints brake as fast as they may, 1/s."""
+        rates = [
+            most / max(abs(speed) * stretch, 1e-9)
+            for speed, most in zip(velocities, self._limits.acceleration, strict=True)
+        ]
+        # Half of the acceleration, because the path's own curvature needs the rest.
+        return max(min(rates) / 2, 1 / _LONGEST_STOP_S)
+
+    def _stream_twists(self) -> Task:
+        """Move at the twist until it is 0 and the tip rests."""
+        while True:
+            if self._now_ns - self._commanded_ns > self.parameters.timeout:
+                self._twist = NO_TWIST
+            linear, angular = self._twist
+            if self._turns_with_tip:
+                rotation = self._chain.pose(self._at)[0]
+                linear, angular = turned(rotation, linear), turned(rotation, angular)
+            self._at = self._stream.advance_joints(self._at, linear, angular, self._period_s)
+            held = self._stream.held_by
+            self._report_hold("" if held < 0 else f"held: joint {self.context.joints[held]} is at its limit")
+            if self._stream.rests and not (any(linear) or any(angular)):
+                return
+            yield
+
+    def _report_hold(self, text: str) -> None:
+        """Report once why the tip is held; an empty text means that it moves."""
+        if text and not self._is_held:
+            self.context.say(text)
+        self._is_held = bool(text)
+
+    def _follow_leader(self, chain: Chain) -> None:
         """Move the followed pose toward that of the leader within the limits in space, and solve it."""
-        begin = self._followed or self._chain.pose(self._at)
+        begin, period_s = self._followed or self._chain.pose(self._at), self._period_s
         linear = angular = _ZERO
-        age_s = float(np.maximum.reduce(self._leader_age))  # NaN if one joint has not answered yet
-        if (leader := self.parameters.leader) is not None and age_s <= self.parameters.timeout * 1e-9:
-            rotation, place = chain.pose(self._leader_position.tolist())
+        # NaN of a joint that has not answered yet counts as the oldest.
+        oldest = int(self._age.argmax())
+        silence, leader = self._silence(oldest), self.parameters.leader
+        if leader is not None and not silence:
+            rotation, place = chain.pose(self._position.tolist())
             x, y, z = (leader.scale * a + b for a, b in zip(place, leader.offset, strict=True))
             way, turn = distance(begin, (rotation, (x, y, z)))
             linear = approach(way, self._limits.linear_acceleration, period_s)
             angular = approach(turn, self._limits.angular_acceleration, period_s)
-            self._said_held = False
-        elif not self._said_held:
-            self._said_held = True
-            worst = int(np.argmax(np.where(np.isnan(self._leader_age), np.inf, self._leader_age)))
-            since = "yet" if math.isnan(age_s) else f"for {age_s:.2f} s"
-            self.context.say(f"no reply from leader {chain.joints[worst]} {since}, holding")
+        self._report_hold(silence and f"no reply from leader {chain.joints[oldest]} {silence}, holding")
         self._stream.change_twist(linear, angular, period_s)
         (a, b, c), (u, v, w) = self._stream.linear, self._stream.angular
         self._followed = shifted(
@@ -597,7 +558,6 @@ def _remark(path: Path, asked: PoseGoal) -> str:
     return f"{off:.1f} deg from the orientation, which the arm cannot reach"
 
 
-def _frames(urdf: Urdf, context: Context) -> FrameTree:
-    """Return all frames of the robot, moved by its joints."""
-    others = (name.removesuffix("/position") for name in context.read_names if name.endswith("/position"))
-    return FrameTree(urdf, (*context.joints, *others))
+@lru_cache(maxsize=8)
+def _frames(urdf: str, base: str, joints: tuple[str, ...]) -> ArmFrames:
+    return ArmFrames(read_urdf(urdf), base, joints)

@@ -14,10 +14,10 @@ import msgspec
 
 from dxlrun.tooling.robots import Urdf, UrdfJoint, from_rpy
 
-Vector: TypeAlias = "tuple[float, float, float]"
+Vector: TypeAlias = tuple[float, float, float]
 Rotation: TypeAlias = "tuple[float, float, float, float, float, float, float, float, float]"
 """Rotation matrix by columns: the x axis, the y axis, the z axis."""
-Quaternion: TypeAlias = "tuple[float, float, float, float]"
+Quaternion: TypeAlias = tuple[float, float, float, float]
 Pose: TypeAlias = "tuple[Rotation, Vector]"
 Column: TypeAlias = "tuple[float, float, float, float, float, float]"
 """Velocity of the link by one joint at unit speed: linear, then angular, in the axes of the base."""

@@ -13,7 +13,7 @@ from dxlrun_space.chain import BASE, Chain, WrongChain
 from dxlrun_space.path import out_of_reach, suffices
 from dxlrun_space.reach import dexterity
 from dxlrun_space.solver import FULL, Search, Solution, Solver
-from dxlrun_space.space_goals import PoseCommand, flat_pose, read_pose
+from dxlrun_space.space_goals import PoseCommand
 
 _GOAL: Final = {"x", "y", "z", "rpy", "quaternion"}
 
@@ -55,7 +55,7 @@ def _solved(compilation: Compilation, pose: form.TipPose) -> Row | None:
     solver = Solver(chain, [plan.lower for plan in plans], [plan.upper for plan in plans], near)
     start = tuple(each or 0.0 for each in near)
     try:
-        goal = read_pose(flat_pose(PoseCommand.model_validate(pose.model_dump(include=_GOAL))))
+        goal = PoseCommand.model_validate(pose.model_dump(include=_GOAL)).as_goal
     except ValidationError as error:
         what, _, fix = error.errors()[0]["msg"].removeprefix("Value error, ").partition("; ")
         raise WrongChain("", what, fix or "remove the others") from None

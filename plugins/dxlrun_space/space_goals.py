@@ -1,32 +1,22 @@
-"""Goals: poses and twists as clients write them, and as flat arrays for the loop."""
+"""Goals: poses and twists as clients write them, and as the loop gets them."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Annotated, Final, Literal, Self
+from typing import Annotated, Final, Literal, Self, TypeVar
 
 import msgspec
 import numpy as np
 from pydantic import BeforeValidator, Field, TypeAdapter, model_validator
 
 from dxlrun import Angle, AngularVelocity, CommandModel, Floats, Length, LinearVelocity
-from dxlrun_space.chain import (
-    Pose,
-    Quaternion,
-    Rotation,
-    Vector,
-    compose,
-    inverted,
-    rotation_of,
-    times,
-    turned,
-)
+from dxlrun.tooling.robots import from_rpy
+from dxlrun_space.chain import Pose, Quaternion, Vector, compose, inverted, rotation_of, times, turned
 
 NORM: Final = 1e-3
 """Largest difference of a quaternion's length from 1: three decimals of each number."""
 _LONGEST_NAME: Final = 200
-_CENTRE: Final[Vector] = (0.0, 0.0, 0.0)
+T = TypeVar("T")
 
 
 def _number(adapter: TypeAdapter[float]) -> BeforeValidator:
@@ -114,6 +104,25 @@ class PoseCommand(CommandModel):
             )
         return self
 
+    @property
+    def as_goal(self) -> PoseGoal:
+        """The pose for the loop."""
+        x, y, z = (math.nan if each is None else each for each in (self.x, self.y, self.z))
+        rotation = None if self.rpy is None else from_rpy(self.rpy)
+        if self.quaternion is not None:
+            length = math.hypot(*self.quaternion)
+            a, b, c, d = self.quaternion
+            rotation = a / length, b / length, c / length, d / length
+        return PoseGoal(
+            (x, y, z),
+            (self.dx or 0.0, self.dy or 0.0, self.dz or 0.0),
+            rotation,
+            from_rpy(self.drpy or (0.0, 0.0, 0.0)),
+            self.path == "line",
+            math.nan if self.seconds is None else self.seconds,
+            self.frame,
+        )
+
 
 class TwistCommand(CommandModel):
     """Velocity of the tip, valid until `timeout` of the controller"""
@@ -129,9 +138,14 @@ class TwistCommand(CommandModel):
     frame: _Frame = ""
     """Link whose axes are meant; those of the tip turn with it. Empty: the base of the controller"""
 
+    @property
+    def as_goal(self) -> TwistGoal:
+        """The twist for the loop."""
+        return TwistGoal((self.vx, self.vy, self.vz), (self.wx, self.wy, self.wz), self.frame)
 
-class PoseGoal(msgspec.Struct, frozen=True):
-    """A prepared pose: values in the axes of a frame; NaN: not given."""
+
+class PoseGoal(msgspec.Struct, frozen=True, array_like=True):
+    """A pose in the axes of a frame; NaN: not given."""
 
     place: Vector
     way: Vector
@@ -151,60 +165,31 @@ class PoseGoal(msgspec.Struct, frozen=True):
         back = inverted(frame[0])
         x, y, z = (a - b for a, b in zip(tip[1], frame[1], strict=True))
         present = turned(back, (x, y, z))
-        place = tuple(
+        a, b, c = (
             (now if math.isnan(goal) else goal) + way
             for now, goal, way in zip(present, self.place, self.way, strict=True)
         )
         rotation = times(back, tip[0]) if self.rotation is None else rotation_of(self.rotation)
-        a, b, c = place
         return compose(frame, (times(rotation_of(self.turn), rotation), (a, b, c)))
 
 
-def flat_pose(command: PoseCommand) -> Floats:
-    """Return a pose command as an array: numbers, then the bytes of the frame's name."""
-    place = [math.nan if each is None else each for each in (command.x, command.y, command.z)]
-    way = [each or 0.0 for each in (command.dx, command.dy, command.dz)]
-    rotation = [math.nan] * 4
-    if command.rpy is not None:
-        rotation = [*_quaternion(command.rpy)]
-    elif command.quaternion is not None:
-        length = math.hypot(*command.quaternion)
-        rotation = [each / length for each in command.quaternion]
-    turn = _quaternion(command.drpy or _CENTRE)
-    more = [float(command.path == "line"), math.nan if command.seconds is None else command.seconds]
-    return np.array([*place, *way, *rotation, *turn, *more, *command.frame.encode()], dtype=np.float64)
+class TwistGoal(msgspec.Struct, frozen=True, array_like=True):
+    """A velocity of the tip in the axes of a frame, m/s and rad/s."""
+
+    linear: Vector
+    angular: Vector
+    frame: str
 
 
-def read_pose(data: Floats) -> PoseGoal:
-    """Return the goal of an array of `flat_pose`."""
-    a, b, c, d, e, f, x, y, z, w, i, j, k, r, line, seconds = data[:16].tolist()
-    rotation = None if math.isnan(w) else (x, y, z, w)
-    return PoseGoal((a, b, c), (d, e, f), rotation, (i, j, k, r), line != 0, seconds, _name(data[16:]))
+def packed(goal: PoseGoal | TwistGoal) -> Floats:
+    """Return a goal as an array for the loop: one number per byte."""
+    return np.frombuffer(msgspec.msgpack.encode(goal), np.uint8).astype(np.float64)
 
 
-def flat_twist(command: TwistCommand) -> Floats:
-    """Return a twist command as an array: linear and angular velocity, then the frame's name."""
-    linear, angular = (command.vx, command.vy, command.vz), (command.wx, command.wy, command.wz)
-    return np.array([*linear, *angular, *command.frame.encode()], dtype=np.float64)
+def unpacked(data: Floats, decoder: msgspec.msgpack.Decoder[T]) -> T:
+    """Return the goal in an array of `packed`."""
+    return decoder.decode(data.astype(np.uint8).tobytes())
 
 
-def read_twist(data: Floats) -> tuple[Vector, Vector, str]:
-    """Return linear velocity, angular velocity and frame of an array of `flat_twist`."""
-    a, b, c, d, e, f = data[:6].tolist()
-    return (a, b, c), (d, e, f), _name(data[6:])
-
-
-def _name(codes: Floats) -> str:
-    return bytes(map(int, codes.tolist())).decode()
-
-
-def _quaternion(rpy: Sequence[float]) -> Quaternion:
-    from dxlrun.tooling.robots import from_rpy
-
-    roll, pitch, yaw = rpy
-    return from_rpy((roll, pitch, yaw))
-
-
-def in_axes(rotation: Rotation, linear: Vector, angular: Vector) -> tuple[Vector, Vector]:
-    """Return a twist, given in the axes of a frame, in the base."""
-    return turned(rotation, linear), turned(rotation, angular)
+POSES: Final = msgspec.msgpack.Decoder(PoseGoal)
+TWISTS: Final = msgspec.msgpack.Decoder(TwistGoal)

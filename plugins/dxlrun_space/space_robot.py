@@ -15,9 +15,10 @@ Angles = Sequence[float | str] | None
 
 
 class PoseRefused(Refused):
-    """An arm did not reach a pose: mostly one out of reach, before a joint moved.
+    """A pose was refused, mostly one out of reach or malformed, or the arm did not reach it.
 
-    `code` is the outcome of the goal: `aborted`, `missed`, `cancelled`, `preempted`.
+    `code` is that of the refusal (`invalid`), or the outcome of the goal: `aborted`, `missed`, `cancelled`,
+    `preempted`.
     """
 
 
@@ -57,29 +58,30 @@ class SpaceRobot(RemoteRobot):
             timeout: Longest wait, s; None waits without limit.
 
         Raises:
-            PoseRefused: The pose is out of reach, or the motion did not end there.
-            Refused: The pose is malformed, or there is no such arm.
+            PoseRefused: The pose is malformed or out of reach, or the motion did not end there.
             GoalTimeout: The motion has not ended within `timeout`.
+            DxlrunError: There is no such arm, or the robot is gone.
         """
         fields = {
             "x": x, "y": y, "z": z, "dx": dx, "dy": dy, "dz": dz, "rpy": rpy, "drpy": drpy,
             "quaternion": quaternion, "frame": frame, "path": path, "seconds": seconds,
         }  # fmt: skip
         pose = {name: value for name, value in fields.items() if value is not None}
-        goal = self.send(arm or self._only_arm(), "pose", pose).goal
-        if goal is None:
-            raise DxlrunError(f"{arm} does not move to poses; name a cartesian_controller")
+        arms = self._arms()
+        if arm not in arms and (arm or len(arms) != 1):
+            raise DxlrunError(f"{self.name} has {len(arms)} arms ({', '.join(arms)}); name one")
+        try:
+            (goal,) = self.send(arm or arms[0], "pose", pose).goals
+        except Refused as refused:
+            raise PoseRefused(str(refused), code=refused.code, fields=refused.fields) from None
         state = goal.wait(timeout)
         if state.status != "reached":
             raise PoseRefused(state.describe_outcome(), code=state.status, fields={"goal": state.number})
         return state
 
-    def _only_arm(self) -> str:
+    def _arms(self) -> list[str]:
         rows = cast("Sequence[Mapping[str, object]]", self.info()["controllers"])
-        arms = [str(row["name"]) for row in rows if row["type"] == "cartesian_controller"]
-        if len(arms) != 1:
-            raise DxlrunError(f"{self.name} has {len(arms)} arms ({', '.join(arms)}); name one")
-        return arms[0]
+        return [str(row["name"]) for row in rows if row["type"] == "cartesian_controller"]
 
 
 def connect(robot: str | None = None, client: str | None = None) -> SpaceRobot:

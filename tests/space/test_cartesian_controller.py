@@ -11,11 +11,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 from pydantic import ValidationError
 from tests.kit.campaigns import campaign
 from tests.kit.judged_arms import apart, arms
 from tests.kit.stages import Stage
 
+from dxlrun import ROTARY, RobotModel
 from dxlrun.channels.cycle import Torque
 from dxlrun_space.cartesian_controller import CartesianController
 
@@ -127,7 +129,6 @@ def test_an_orientation_that_the_arm_lacks_is_reported() -> None:
     ("pose", "text"),
     [
         ({"x": 0.9}, "the pose is out of reach; the nearest is "),
-        ({"dz": 0.01, "frame": "hand"}, "frame hand not found; "),
         ({"dz": 0.05, "seconds": 0.1}, "the motion takes 0.76 s within its limits; ask for"),
     ],
 )
@@ -238,10 +239,43 @@ def test_a_joint_that_has_not_answered_refuses_goals() -> None:
     stage.activate()
     stage.send(0.0, "pose", dz=0.1)
     assert stage.goal.ended[0][1] == "joint joint3 has not answered yet"
-    stage.context.reads[:] = math.nan
-    stage.states.position[2] = stage.sent.position[2] = 0.6
-    stage.send(0.1, "pose", dz=0.01, frame="left_finger")
-    assert "a joint has not answered yet" in stage.goal.ended[0][1]
+
+
+def test_only_frames_that_a_silent_joint_moves_are_refused() -> None:
+    for age, since in ((math.nan, "yet"), (0.21, "for 0.21 s")):
+        stage, text = staged(), f"no reply from gripper {since}, which moves frame left_finger"
+        stage.context.reads[1] = age
+        stage.send(0.0, "pose", dz=0.01, frame="left_finger")
+        assert played(stage, 0.2) == pytest.approx(np.tile(READY, (10, 1)))
+        assert stage.goal.ended[0][:2] == ("aborted", text)
+        streamed(stage, 0.5, vz=0.05)
+        rows = streamed(stage, 1.0, vz=0.05, frame="left_finger")
+        assert stage.warned == [f"twist ignored: {text}"]
+        assert np.abs(rows[-1] - rows[-2]).max() == 0.0
+        stage.send(None, "pose", dz=0.01, frame="link3")
+        stage.context.reads[1] = 0.19
+        played(stage, 2.0)
+        stage.send(None, "pose", dz=-0.01, frame="left_finger")
+        played(stage, 2.0)
+        assert [goal.ended[0][0] for goal in stage.goals] == ["aborted", "reached", "reached"]
+
+
+def test_frames_that_a_joint_without_a_servo_moves_are_refused() -> None:
+    model = RobotModel(ARM, (None,) * 4, (None,) * 4, (ROTARY,) * 4, all_arms()["open_manipulator_x"].urdf)
+    given = CartesianController.Parameters.model_validate({"joints": ARM, "tip": "end_effector_link"})
+    for kind in ("pose", "twist", "plan"):
+
+        def check(frame: str, robot: RobotModel, kind: str = kind) -> None:
+            command = {"frame": frame} | ({} if kind == "twist" else {"dz": 0.1})
+            sent = CartesianController.Commands[kind].model_validate(command)
+            CartesianController.check_command(kind, sent, given, robot)
+
+        with pytest.raises(ValueError, match="frame left_finger moves with joint gripper, which is omitted"):
+            check("left_finger", model)
+        with pytest.raises(ValueError, match="frame link33 not found; known: end_eff"):
+            check("link33", model)
+        check("link3", model)
+        check("left_finger", replace(model, others=("gripper",)))
 
 
 def streamed(stage: Stage, seconds: float, **twist: Any) -> Any:

@@ -105,7 +105,15 @@ def test_move_to_waits_for_the_pose_and_raises_what_refused_it(monkeypatch: pyte
         assert robot.states().position.tolist() == pytest.approx(before, abs=2e-3)
         assert robot.move_to(x=0.2, y=0, z=0.15, quaternion=(0, 0.5, 0, 0.866)).reached
         assert robot.move_to(dz=-0.03, seconds=2.0).seconds == pytest.approx(2.0, abs=0.3)
-        with pytest.raises(DxlrunError, match="gripper"):
+        for x, frame, text in (
+            (math.nan, "", "nan"),
+            ("3deg", "", "3deg"),
+            (0.2, "no", "frame no not"),
+        ):
+            with pytest.raises(PoseRefused, match=text) as refused:
+                robot.move_to(x=x, frame=frame)
+            assert refused.value.code == "invalid"
+        with pytest.raises(DxlrunError, match=r"has 1 arms \(arm\); name one"):
             robot.move_to("gripper", dz=0.01)
     with pytest.raises(DxlrunError, match=r"bioloid_torso has 0 arms \(\); name one"):
         robot_of("bioloid_torso", SpaceRobot).move_to(dz=0.01)

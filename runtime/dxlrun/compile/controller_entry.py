@@ -7,7 +7,7 @@ and a replay use only the sentences.
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import NamedTuple, TypeVar
 
@@ -18,7 +18,13 @@ from pydantic import ValidationError
 from dxlrun.compile.controller_graph import Mistake
 from dxlrun.contract.controller import RegisterChange
 from dxlrun.control.controllers.offers import Breach
-from dxlrun.control.controllers.plugin_loading import Offer, PlugIns, interfaces_breach, mismatches
+from dxlrun.control.controllers.plugin_loading import (
+    Offer,
+    PlugIns,
+    interfaces_breach,
+    mismatches,
+    robot_model,
+)
 from dxlrun.control.controllers.single_files import is_of_file
 from dxlrun.description.base_form import ParametersModel
 from dxlrun.description.document import KeyPath
@@ -187,7 +193,8 @@ def compile_entry(
     with code.asked_to("name its interfaces"):
         interfaces = cls.interfaces(parameters, tuple(joints))
         # With all joints of the file, a controller that reads every joint also reads those that are omitted.
-        reads = cls.interfaces(parameters, (*joints, *omitted)).reads if omitted else ()
+        whole = cls.interfaces(parameters, (*joints, *omitted)) if omitted else interfaces
+        reads = [name for name in whole.reads if name not in whole.optional] if omitted else []
     if breach := interfaces_breach(interfaces, chained=bool(plan.into)):
         raise code.broken(breach)
     needed = {*interfaces.joints, *(name.partition("/")[0] for name in reads)}
@@ -218,14 +225,18 @@ def compile_entry(
     )
 
 
-def require_fit(controller: CompiledController, joints: Sequence[JointPlan], urdf: str | None) -> None:
+def require_fit(
+    controller: CompiledController, own: Sequence[JointPlan], joints: Iterable[str], urdf: str | None
+) -> None:
     """Raise WrongEntry if a controller cannot work on the robot: motor data, servos or URDF do not fit.
 
-    `joints` are the controller's joints, `urdf` is the text of the URDF.
+    `own` are the controller's joints, `joints` the names of all, and `urdf` is the text of the URDF.
     """
     plan, offer = controller.plan, controller.offer
     with PlugInCode("controller", plan.name, offer.distribution).asked_to("compare itself with the robot"):
-        found = mismatches(offer.controller, controller.parameters, controller.motors, joints, urdf)
+        found = mismatches(
+            offer.controller, controller.parameters, controller.motors, own, robot_model(own, joints, urdf)
+        )
     if found:
         start = ("controllers", plan.name)
         raise WrongEntry(

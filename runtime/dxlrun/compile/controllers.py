@@ -289,7 +289,7 @@ def check_robot(
         if unread or len(own) < len(controller.plan.joints) or (urdf is None and robot.model is not None):
             continue
         try:
-            require_fit(controller, own, urdf)
+            require_fit(controller, own, robot.joints, urdf)
         except WrongEntry as wrong:
             _report(file, wrong)
 

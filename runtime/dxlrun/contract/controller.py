@@ -93,6 +93,8 @@ class Interfaces(msgspec.Struct, frozen=True):
             of some, and if it may be activated without them. Commands for joints without torque have no
             effect; `states.unable` returns them.
         registers: All values that it passes to `Context.set_registers`, each checked before a run.
+        optional: Names in `reads` that the controller can do without. If a run omits their joint, it gets
+            the others.
     """
 
     joints: tuple[str, ...]
@@ -106,6 +108,7 @@ class Interfaces(msgspec.Struct, frozen=True):
     asked_by: Mapping[CommandName, tuple[str | int, ...]] = msgspec.field(default_factory=dict)
     partial: bool = False
     registers: tuple[RegisterChange, ...] = ()
+    optional: tuple[str, ...] = ()
 
     @property
     def source_commands(self) -> tuple[str, ...]:
@@ -136,6 +139,8 @@ class RobotModel(msgspec.Struct, frozen=True):
     """Unit of each joint's position."""
     urdf: str | None
     """Text of the robot's URDF; None: the robot file does not name one."""
+    others: tuple[str, ...] = ()
+    """All other joints of the robot, without those that the run omits."""
 
 
 class Mismatch(msgspec.Struct, frozen=True):
@@ -429,7 +434,8 @@ class Controller(ABC, Generic[P]):
         """Return the joints and interfaces that the controller requires and offers.
 
         Unknown and repeated joints are refused when the robot is compiled. Keys named `joint` or `joints`
-        and mappings by joint let a run omit a joint; a controller that still reads it is refused.
+        and mappings by joint let a run omit a joint; a controller that still reads it is refused, unless the
+        read is `optional`.
 
         Args:
             parameters: Parameters of the controller.
@@ -478,6 +484,16 @@ class Controller(ABC, Generic[P]):
             if isinstance(values, Sized) and len(values) != len(joints):
                 raise ValueError(f"{len(values)} {what} for {len(joints)} joints ({', '.join(joints)})")
         return np.hstack([np.asarray(values, dtype=np.float64) for values in fields.values()])
+
+    @classmethod
+    def check_command(cls, kind: str, command: CommandModel, parameters: P, robot: RobotModel) -> None:
+        """Check a client's command against the robot, such as names of its URDF. Must be a pure function.
+
+        It is called after `prepare`, outside of the loop's process.
+
+        Raises:
+            ValueError: The robot cannot execute the command; with one sentence.
+        """
 
     @classmethod
     def speed_peaks(cls, kind: str, data: NDArray[np.float64], parameters: P) -> Iterable[SpeedPeak]:

@@ -28,7 +28,7 @@ from dxlrun.compile.controller_entry import (
 from dxlrun.compile.controller_graph import ControllerGraph, Mistake
 from dxlrun.compile.joints.limits import LimitViolation, beyond_limits
 from dxlrun.compile.motions import TRAJECTORY
-from dxlrun.control.controllers.plugin_loading import ControllerClass, PlugIns
+from dxlrun.control.controllers.plugin_loading import ControllerClass, PlugIns, robot_model
 from dxlrun.control.controllers.update_order import rate_divider, rate_fits
 from dxlrun.description.base_form import Name, ParametersModel
 from dxlrun.description.form_problems import sentences_of
@@ -291,6 +291,8 @@ class Preparation:
         with plugin_code(plan.name, what, model):
             command = model.model_validate_json(body, strict=True)
             prepared = controller.prepare(kind, command, known.parameters)
+            robot = robot_model(known.joints, self.joints, self.urdf)
+            controller.check_command(kind, command, known.parameters, robot)
             data = np.ascontiguousarray(prepared, dtype="<f8").tobytes()
             peaks = controller.speed_peaks(kind, np.frombuffer(data, "<f8"), known.parameters)
             beyond = tuple(beyond_limits(known.joints, command, peaks))
@@ -362,7 +364,9 @@ class Preparation:
                     groups=self.groups,
                     omitted=self.omitted,
                 )
-                require_fit(found, [self.joints[joint] for joint in found.plan.joints], self.urdf)
+                require_fit(
+                    found, [self.joints[joint] for joint in found.plan.joints], self.joints, self.urdf
+                )
             if found.registers:
                 raise invalid(texts.registers_loaded(plan.name))
         except ValidationError as error:

@@ -7,7 +7,7 @@ and the types of declared attributes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -603,6 +603,8 @@ def _names_breach(interfaces: Interfaces) -> Breach | None:
         return "returns lists in its interfaces", fix
     if wrong := [name for name in interfaces.provides if not name or "/" in name]:
         return f"provides {', '.join(map(repr, wrong))}", "choose names without `/`, such as orientation.x"
+    if unread := [name for name in interfaces.optional if name not in interfaces.reads]:
+        return f"has optional reads that it does not read: {', '.join(unread)}", "list them in reads, too"
     figures = MotorModel.__struct_fields__
     if strange := [name for name in interfaces.motors if name not in figures]:
         return f"needs unknown motor data: {', '.join(strange)}", f"choose from {', '.join(figures)}"
@@ -631,7 +633,7 @@ def mismatches(
     parameters: ParametersModel,
     motors: Sequence[str],
     joints: Sequence[JointPlan],
-    urdf: str | None,
+    robot: RobotModel,
 ) -> list[Mismatch]:
     """Return the reasons why a controller does not suit a robot.
 
@@ -642,16 +644,22 @@ def mismatches(
         parameters: Parameters of the controller.
         motors: Figures that the controller needs of each motor.
         joints: Joints of the controller.
-        urdf: URDF of the robot.
+        robot: Robot of the controller.
     """
     lacking = [(joint.name, motor_breach(motors, joint)) for joint in joints]
     if found := [Mismatch(*breach, name) for name, breach in lacking if breach is not None]:
         return found
-    robot = RobotModel(
-        tuple(joint.name for joint in joints),
-        tuple(joint.servo_model for joint in joints),
-        tuple(joint.motor for joint in joints),
-        tuple(joint.unit for joint in joints),
-        urdf,
-    )
     return list(controller.mismatches(parameters, robot))
+
+
+def robot_model(own: Sequence[JointPlan], joints: Iterable[str], urdf: str | None) -> RobotModel:
+    """Return a controller's view of its robot, from its own joints, the names of all, and the URDF."""
+    names = tuple(joint.name for joint in own)
+    return RobotModel(
+        names,
+        tuple(joint.servo_model for joint in own),
+        tuple(joint.motor for joint in own),
+        tuple(joint.unit for joint in own),
+        urdf,
+        tuple(name for name in joints if name not in names),
+    )

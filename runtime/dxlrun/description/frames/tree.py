@@ -197,6 +197,28 @@ class FrameTree:
             frame = self._frames[frame.parent]
         return found
 
+    def _ends(self, of: str, relative_to: str) -> tuple[str, str]:
+        known = [each.name for each in self.frames]
+        for name in filter(None, (of, relative_to)):
+            if name not in self._frames:
+                raise LookupError(f"frame {name} not found; {suggestion(name, known)}")
+        return of, relative_to or known[0]
+
+    def movers(self, of: str, relative_to: str = "") -> tuple[str, ...]:
+        """Return the joints that move the frame `of` in another frame; empty: the root.
+
+        A joint that mimics another one is not among them, but that one is. Raises LookupError as `pose`.
+        """
+        ends = self._ends(of, relative_to)
+        shared, found = self._shared(*ends), dict[str, None]()
+        for end in ends:
+            frame = self._frames[end]
+            while frame.name != shared:
+                if frame.joint is not None and frame.joint.moves:
+                    found[leader(self._joints, frame.joint, self.moved)[0].name] = None
+                frame = self._frames[frame.parent]
+        return tuple(found)
+
     def pose(
         self,
         of: str,
@@ -216,16 +238,12 @@ class FrameTree:
             LookupError: A frame or joint does not exist.
             ValueError: A position is not finite.
         """
-        known = [each.name for each in self.frames]
-        for name in filter(None, (of, relative_to)):
-            if name not in self._frames:
-                raise LookupError(f"frame {name} not found; {suggestion(name, known)}")
+        ends = self._ends(of, relative_to)
         for name in positions:
             joint = self._joints.get(name)
             if joint is None or not joint.moves:
                 moving = [each.name for each in self._joints.values() if each.moves]
                 raise LookupError(f"movable joint {name} not found; {suggestion(name, moving)}")
-        ends = (of, relative_to or known[0])
         shared = self._shared(*ends)  # The frames above the common ancestor do not matter.
         found, base = (self._below(name, shared, positions, orientation) for name in ends)
         if found is None or base is None:

@@ -39,7 +39,7 @@ class Omission(msgspec.Struct, frozen=True):
     names: tuple[str, ...] = ()
     """Joints that are omitted, then groups that have no other joint."""
     remarks: tuple[Problem, ...] = ()
-    """A warning that names the joints, what is omitted with them, and what continues without them."""
+    """A warning that names the joints, what is omitted with them, and what is without them."""
     uneven: tuple[KeyPath, ...] = ()
     """Lists of controllers that may have one value for each joint, also for those omitted."""
 
@@ -73,8 +73,7 @@ def omit_joints(grown: PlainDocument, without: Sequence[str]) -> Omission:
     if remover.gone:
         what += f", and with {it} {_by_kind(remover.gone)}"
     if remover.changed:
-        verb = "continues" if len(remover.changed) == 1 else "continue"
-        what += f"; {_by_kind(remover.changed)} {verb} without {it}"
+        what += f"; {_by_kind(remover.changed)} {'is' if len(remover.changed) == 1 else 'are'} without {it}"
     fix = "omit --without" if in_file is None else f"remove {INSTALLED}: false"
     remark = Problem(mark, what, f"{fix} to run with {it}", severity="warning")
     left = _mapping(reduced.data.get("groups"))
