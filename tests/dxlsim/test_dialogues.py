@@ -14,8 +14,8 @@
 `let NAME = EXPRESSION`, `poke ITEM = EXPRESSION`, `device ID MODEL`, `hand ANGLE`, `temperature@2`,
 `voltage`, `overload`, `power cycle`, `mute`, `absent slot`, `rate`, `unread ITEM` and `no note` explain
 themselves. Expressions have the functions of `math`; of servo 1 `angle` and `speed` (rad), `tick` and
-`speed_tick` (rad and rad/s of one) and `memory` (its registers); `clock` and `last_s` (s; of the newest
-reply), and `received` (bytes of the newest answers).
+`speed_tick` (rad and rad/s of one), `motor` and `memory` (its registers); `clock` and `last_s` (s; of the
+newest reply), and `received` (bytes of the newest answers).
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from tests.kit.cases import read_cases
 from tests.kit.line_faults import turn_by_hand
 from tests.kit.simulated_line import Answer, Line, split_statuses
 
+from dxlsim.motion.motor import motor_of
 from dxlsim.simulation_plan import DeviceConfig, Load
 
 INSTRUCTIONS = {
@@ -74,6 +75,7 @@ class Values(dict[str, Any]):
             "speed_tick": lambda: table.rad_s_per_tick,
             "max_speed": lambda: table.max_speed,
             "torque_on": lambda: servo.torque_on,
+            "motor": lambda: motor_of(table),
             "clock": lambda: self.line.clock.now_ns() / 1e9,
             "last_s": lambda: (
                 next(e.t_ns for e in reversed(self.line.ledger.entries) if e.direction == "out") / 1e9

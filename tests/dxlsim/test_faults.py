@@ -77,17 +77,3 @@ def test_a_lossy_line_loses_a_share_of_the_packets_of_every_servo():
     line.inject("lossy share=0.2", seed=1)
     for servo_id in (1, 2):
         assert 140 < sum(ping(line, servo_id) for _ in range(200)) < 180
-
-
-def test_a_supply_with_a_resistance_sags_by_what_a_servo_draws():
-    line = Line()
-    first, other = line.servo(1), line.servo(2)
-    before = other.voltage
-    line.inject("sag ohms=2 for=400ms")
-    line.put(goal_position=100)
-    line.wait(0.1)
-    line.bus.advance_to(line.clock.now_ns())
-    assert first.voltage == other.voltage < before - 0.05
-    line.wait(1)
-    line.bus.advance_to(line.clock.now_ns())
-    assert other.voltage == before

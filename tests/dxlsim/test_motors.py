@@ -251,3 +251,31 @@ def test_simulated_motors_take_up_speed_with_their_own_time_constant(model, prot
         constant = (motor.inertia + load.inertia) / motor.damping
         exact = motor.stall_torque / motor.damping * -math.expm1(-steps * dt_s / constant)
         assert plant.velocity[0] == pytest.approx(exact, rel=0.003)
+
+
+def test_every_model_settles_where_it_should_without_much_overshoot():
+    mechanics, tables = Mechanics(0), [table for table in all_tables() if table.model != "XL-320"]
+    servos = [
+        make_servo(ServoConfig(1, each.model, 1.0), 57_600, 0, None, each.protocol, mechanics=mechanics)
+        for each in tables
+    ]
+    goals = []
+    for servo, table in zip(servos, tables, strict=True):
+        goals.append(round(min(1.5, 0.9 * table.max_tick * table.rad_per_tick) / table.rad_per_tick))
+        servo.poke("torque_enable", 1)
+        servo.poke("goal_position", goals[-1])
+    highest = [0.0] * len(servos)
+    for now in range(0, 3 * S, 10_000_000):
+        mechanics.step_to(now)
+        highest = [max(pair) for pair in zip(highest, mechanics.plant.angle.tolist(), strict=True)]
+    torques = mechanics.servos["torque"].tolist()
+    for servo, goal, top, torque in zip(servos, goals, highest, torques, strict=True):
+        servo.advance_to(3 * S)
+        table, margin = servo.registers.table, servo.registers.get("cw_compliance_margin")
+        motor = motor_of(table)
+        assert abs(torque) <= 1.001 * motor.friction / (1 - motor.load_friction)
+        # so much friction leaves where gains are weakest, those of YM070
+        rest = math.radians(2.3) + margin * table.rad_per_tick
+        assert servo.shaft_angle == pytest.approx(goal * table.rad_per_tick, abs=rest)
+        assert top < goal * table.rad_per_tick + 0.25 * 0.5, table.model  # most: the quick XL330-M077
+        assert servo.registers.get("moving") == 0

@@ -9,8 +9,6 @@ from dxlsim.servo.making import make_servo
 from dxlsim.simulation_plan import ServoConfig
 
 BACKUP, FAST_SYNC_READ, ACCESS = 0x20, 0x8A, 7
-BACK_UP = bytes.fromhex("01 4354524c")
-"""An instruction with a wrong checksum, and the error of its answer."""
 
 
 @pytest.mark.parametrize(("model", "most_ns"), [("AX-12A", 100_000_000), ("XM430-W350", 1_500_000)])
@@ -60,40 +58,6 @@ def test_waking_by_a_goal_can_be_switched_off():
     line.put(torque_enable=1)  # and then it moves to the goal that is there
     line.wait(2)
     assert line.get("present_position") == pytest.approx(700, abs=2)
-
-
-@pytest.mark.parametrize(
-    ("model", "firmware", "backs_up", "reads_fast"),
-    [
-        ("XM430-W350", 44, False, False),
-        ("XM430-W350", 45, True, True),
-        ("XL330-M288", 45, False, False),
-        ("XL330-M288", 46, True, True),
-        ("XL330-M288", 52, True, True),
-        ("PH54-200-S500", 11, False, False),
-        ("PH54-200-S500", 12, True, True),
-        ("2XL430-W250", 44, False, False),
-        ("2XL430-W250", 45, True, False),
-        ("MX-64", 45, False, False),
-        ("XL-320", 45, False, False),
-    ],
-)
-def test_backup_and_fast_reads_came_with_a_firmware(model, firmware, backs_up, reads_fast):
-    line = Line(model, 1, protocol=2.0, firmware=firmware)
-    assert line.request(1, BACKUP, BACK_UP) == ((1, 0, b"") if backs_up else (1, 2, b""))
-    line.instruct(0xFE, FAST_SYNC_READ, bytes.fromhex("0000 0200 01"))
-    assert bool(line.receive()) == reads_fast
-
-
-@pytest.mark.parametrize(
-    ("model", "firmware"), [("XM430-W350", 44), ("2XC430-W250", 44), ("XC330-T288", 45), ("MX-106", 60)]
-)
-def test_startup_configuration_came_with_a_firmware(model, firmware):
-    line = Line(model, 1, protocol=2.0, firmware=firmware)
-    assert "startup_configuration" not in line.servo().registers
-    assert line.write_bytes(60, b"\x01") == ACCESS
-    line.servo().power_cycle()
-    assert line.get("torque_enable") == 0
 
 
 @pytest.mark.parametrize(
