@@ -36,8 +36,8 @@ PLATFORMS = ("manylinux_2_17_aarch64", "manylinux2014_aarch64", "manylinux_2_28_
 BINFMT = Path("/proc/sys/fs/binfmt_misc")
 RUN = "dxlrun robots/bioloid_torso.yaml --play robots/motions/three_parts.yaml"
 TESTS = (
-    "tests/run/channels tests/sensors/test_slot.py tests/compile/test_{cases,limits}.py "
-    "tests/dxlwire/test_{protocol1,protocol2,receiver,bus}.py "
+    "tests/run/channels tests/sensors/test_readings.py tests/compile/test_{cases,limits}.py "
+    "tests/dxlwire/test_{protocols,bus}.py "
     "tests/dynamixel/test_{kernel,kernel_rules,goals,samples}.py "
     "tests/control/test_{gate,loop,manager}.py "
     "tests/log/test_{messages,log,recorder}.py"

@@ -7,7 +7,7 @@ and in order, and every intact packet is delivered exactly once.
 
     python bench/fuzz_receiver.py 1000000
 
-CI runs a seeded sample of it (tests/dxlwire/test_receiver.py).
+CI runs a seeded sample of it (tests/dxlwire/test_protocols.py).
 """
 
 from __future__ import annotations

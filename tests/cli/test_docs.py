@@ -57,7 +57,7 @@ TESTS = {
     "results.md": ("tests/lab/tracking/test_command.py",),
     "recipes.md": ("tests/cli/test_recipes.py", "tests/robots/test_stand_up.py"),
     "replay.md": ("tests/analysis/replay/test_command_line.py",),
-    "sensors.md": ("tests/sensors/test_page.py",),
+    "sensors.md": ("tests/sensors/test_serial_imu.py",),
     "standard-controllers.md": ("tests/space/test_page.py",),
     "space.md": ("tests/space/test_tutorial.py",),
     "steering.md": ("tests/cli/test_steer.py",),

@@ -1,22 +1,28 @@
 # ruff: noqa: E501 (a mistake and its sentence are read best side by side)
-"""Limits of joints, for motions, commands and clients: each side, each sign, and the bound itself."""
+"""Limits and properties of joints, for motions, commands and clients: each side, each sign, and the bound itself."""
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
+from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from tests.kit.robots import compile_text, robot_text
 
+from dxlrun.cli import check
 from dxlrun.compile.joints.limits import Interval, beyond_limits, check_samples, degrees, limits_of
 from dxlrun.compile.motion_samples import MotionSample, SampledTarget
 from dxlrun.compile.problems import Problems
+from dxlrun.compile.robot_compiler import compile_files
 from dxlrun.contract.controller import CommandModel, SpeedPeak
 from dxlrun.control.controllers.plugin_loading import load_plugins
 from dxlrun.errors import Mark
-from dxlrun.plan.loop_plan import JointPlan
+from dxlrun.output.text_table import Table
+from dxlrun.plan.loop_plan import JOINT_PROPERTIES, JointPlan, JointProperty, JointValues
 from dxlrun.remote.preparation import Preparation, RefusedRequest
 from dxlrun_controllers.group import (
     EffortsCommand,
@@ -30,7 +36,7 @@ from dxlrun_controllers.motions.trajectory_command import (
     flat_trajectory,
     trajectory_speed_peaks,
 )
-from dxlwire.control_table import find_table
+from dxlwire.control_table import all_tables, find_table
 from dxlwire.joint_unit import LINEAR
 
 MARK = Mark("m.yaml", 3, 5)
@@ -255,3 +261,73 @@ def test_values_of_a_command_belong_to_the_joints_that_it_names():
     assert found == []
     (beyond,) = beyond_limits(JOINTS, Named(joints=["arm", "free"], positions=[0.6, 1.5]))
     assert beyond.joint == "arm"
+
+
+ROBOT = Path(__file__).parents[2] / "robots" / "mechanics.yaml"
+
+
+def _joint_table() -> tuple[list[dict[str, object]], Table]:
+    compiled = compile_files(ROBOT, {}, [])
+    return compiled.report["joints"], next(iter(check._tables(compiled)))
+
+
+def test_property_with_a_column_is_in_json_and_table(monkeypatch: pytest.MonkeyPatch) -> None:
+    wide = JointProperty("tolerance", lambda joint: joint.goal_tolerance, column="")
+    monkeypatch.setattr("dxlrun.compile.check_report.JOINT_PROPERTIES", (*JOINT_PROPERTIES, wide))
+    rows, table = _joint_table()
+    assert all(row["tolerance"] for row in rows)
+    names = [column.name for column in table.columns]
+    cells = {row[0].text: row[names.index("tolerance")].text for row in table.rows}
+    assert cells["knee"] == "5"
+    assert cells["gripper"] == "5 mm"
+
+
+def test_limit_of_the_servo_is_marked_in_the_table() -> None:
+    rows, table = _joint_table()
+    column = [one.name for one in table.columns].index("velocity")
+    assert rows
+    for row, cells in zip(rows, table.rows, strict=True):
+        assert cells[column].text.endswith("(servo)") == (row["velocity_source"] == "servo")
+
+
+def test_running_robot_lists_the_same_properties() -> None:
+    joints = compile_files(ROBOT, {}, []).plan.loop.joints
+    values = JointValues.from_joints(joints, {})
+    fields = {one.listed for one in JOINT_PROPERTIES if one.listed}
+    assert fields | {"effort_units", "joint_keys"} == {one.name for one in dataclasses.fields(JointValues)}
+    found = msgspec.to_builtins(values)
+    assert found["units"].keys() == found["speeds"].keys() == {joint.name for joint in joints}
+    assert [name for name, unit in found["units"].items() if unit == "m"] == ["gripper"]
+    assert found["limits"].keys() == {joint.name for joint in joints if joint.bounded}
+
+
+SPAN = """\
+name: span
+buses: {{main: {{port: sim, protocol: {protocol}, baud_rate: 1_000_000, adapter: {{latency: 0 ms}}}}}}
+loop: {{rate: 50}}
+joints:
+  left_arm_joint: {{bus: main, id: 1, model: "{model}", reference: {left:.12f} rad, direction: 1}}
+  right_arm_joint: {{bus: main, id: 2, model: "{model}", reference: {right:.12f} rad, direction: -1}}
+"""
+
+
+@pytest.mark.parametrize(
+    "table", [table for table in all_tables() if not table.firmware], ids=lambda table: table.model
+)
+def test_a_joint_reaches_every_goal_position_of_its_model(table):
+    low, high = table.min_tick * table.rad_per_tick, table.max_tick * table.rad_per_tick
+    left = low + 0.25 * (high - low)
+    text = SPAN.format(protocol=table.protocol, model=table.model, left=left, right=low + high - left)
+    compiled = compile_text(text)
+    ticks = [(servo.lower_tick, servo.upper_tick) for servo in compiled.plan.buses[0].servos]
+    assert ticks == [(table.min_tick, table.max_tick)] * 2
+    reached = [value for joint in compiled.plan.loop.joints for value in (joint.lower, joint.upper)]
+    assert reached == pytest.approx([low - left, high - left] * 2)
+    assert compiled.warnings == (), "the reference is in the travel, and the twins are mirror images"
+
+
+@pytest.mark.parametrize(("left", "count"), [(-3.1, 0), (-3.2, 2)])
+def test_a_reference_outside_of_a_travel_to_both_sides_of_0_is_a_warning(left: float, count: int):
+    text = SPAN.format(protocol=2.0, model="PH54-200-S500", left=left, right=-left)
+    found = [one.what.partition("S500 ")[2] for one in compile_text(text).warnings]
+    assert found == ["(-180..180 deg), so the joint cannot reach 0"] * count

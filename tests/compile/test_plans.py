@@ -1,27 +1,33 @@
-"""Plans as JSON, of today and of earlier versions, and what two files or two plans together decide."""
+"""Plans as JSON, of today and of earlier versions; what two files or two plans together decide; graphs."""
 
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import msgspec
 import pytest
 from msgspec.structs import replace
+from tests.kit.pages import page_text
 from tests.kit.robot_cases import compile_cases
 from tests.kit.robots import CASES, PAIR, compile_text, problems_in, robot_text, whole_text
 
+from dxlrun.channels.event_records import EventCode
 from dxlrun.compile.buses import slowest_period_ns
+from dxlrun.compile.controller_graph import ControllerGraph, GraphEdge
 from dxlrun.compile.policies import MARGIN_NS
 from dxlrun.compile.robot_compiler import compile_files, compile_robot
 from dxlrun.description.reading import read_robot
 from dxlrun.errors import InputError, Mark
-from dxlrun.plan.loop_plan import JointPlan
+from dxlrun.plan.loop_plan import ControllerPlan, JointPlan
 from dxlrun.plan.robot_plan import SimulationPlan, from_json, to_json
+from dxlrun.testing import read_log, simulated_robot
 from dxlwire.joint_unit import LINEAR
 from dxlwire.plan import planning
 
-ROBOTS = sorted({*CASES.glob("*.txt")} - {CASES / "controllers.txt"})  # whose section is empty
+INCOMPLETE = {CASES / "controllers.txt", CASES / "motion_form.txt"}  # an empty section, and no controllers
+ROBOTS = sorted({*CASES.glob("*.txt")} - INCOMPLETE)
 PHYSICS = pytest.mark.needs("physics")
 MECHANICS = robot_text("mechanics")
 POLICIES = robot_text("policies")
@@ -204,3 +210,78 @@ def test_character_that_is_not_allowed_in_a_urdf_is_refused_at_its_place() -> No
     Path("pair.urdf").write_text("<robot>\x01</robot>")
     (error,) = [one for one in problems_in(f"{PAIR}model: {{urdf: pair.urdf}}\n") if one.severity == "error"]
     assert str(error).endswith("pair.urdf:1:8: the character U+0001 is not allowed in URDF; remove it")
+
+
+@pytest.mark.usefixtures("part_plugins")
+def test_right_graph_has_its_order_and_its_edges():
+    loop = compile_text(robot_text("graph")).plan.loop
+    graph = ControllerGraph(joints=("shoulder", "elbow", "wrist"), controllers=loop.controllers)
+    assert graph.order == ("arm", "limiter", "feed", "watch", "arm_pid", "hand", "still")
+    assert [edge for edge in graph.edges if edge.joint == "elbow" and edge.kind != "command"] == [
+        GraphEdge("reference", "arm", "limiter", "elbow", ("position", "velocity")),
+        GraphEdge("read", "arm_pid", "watch", "elbow", ("position",)),
+        GraphEdge("reference", "limiter", "arm_pid", "elbow", ("position", "velocity")),
+        GraphEdge("reference", "feed", "arm_pid", "elbow", ("effort",)),
+    ]
+    assert GraphEdge("command", "arm_pid", "shoulder", "shoulder", ("effort",)) in graph.edges
+    assert GraphEdge("read", "wrist", "watch", "wrist", ("temperature",)) in graph.edges
+
+
+def test_the_chain_of_the_page_is_right():
+    page = page_text("robot-file.md")
+    (chain,) = [text for text in re.findall(r"```yaml\n(.*?)```", page, re.DOTALL) if "into:" in text]
+    assert problems_in(robot_text("controllers").replace("controllers:\n", "") + chain) == ()
+
+
+def test_controller_that_reads_itself_is_warned_about_and_can_be_ordered() -> None:
+    plan = ControllerPlan("low", "part", "", "{}", ("j",), ("effort",), (), True, 1)
+    low = replace(plan, reference=("position",), reads=("low/j/position",))
+    own = replace(
+        plan, name="filter", joints=(), command=(), reads=("filter/x", "filter/age"), provides=("x",)
+    )
+    graph = ControllerGraph(("j",), (low, own))
+    assert [*graph.find_mistakes()] == []
+    assert graph.order == ("low", "filter")
+    assert [one.what for one in graph.warnings()] == [
+        "low reads low/j/position, its own reference",
+        "filter reads filter/x, its own state of the previous cycle",
+    ]
+
+
+ROBOT = robot_text("watchdog")
+
+
+@pytest.mark.parametrize(
+    ("word", "ended", "torque", "back"),
+    [
+        ("hold", "ended", [True, True, True], [", with its torque and its goal as before"]),
+        ("limp", "ended", [False, False, True], [" and limp: it gets no goals"]),
+        ("stop", "fault", None, []),
+    ],
+)
+def test_group_has_its_own_policy_for_a_lost_servo(
+    here: None, word: str, ended: str, torque: list[bool] | None, back: list[str]
+) -> None:
+    path = Path("two.yaml")
+    groups = f"groups: {{pair: {{joints: [pan, tilt], on_lost_servo: {word}}}}}"
+    path.write_text(ROBOT.replace("exit_timeout: 2 s", f"exit_timeout: 2 s, {groups}"))
+    robot = simulated_robot(path, duration_s=1.8, log=Path("run.mcap"))
+    servos = robot.buses[0].servos
+    seen: list[list[bool]] = []
+    robot.buses[0].at(300_000_000, servos[1].silence)
+    robot.buses[0].at(600_000_000, lambda: servos[1].silence(False))
+    robot.buses[0].at(1_700_000_000, lambda: seen.append([servo.torque_on for servo in servos]))
+    assert robot.run().reason == ended
+    assert seen == ([] if torque is None else [torque])
+    events = read_log(Path("run.mcap")).events
+    assert "tilt" in {event.source for event in events if event.code == EventCode.SERVO_LOST}
+    said = [event.text for event in events if event.code == EventCode.SERVO_BACK]
+    assert [text.rpartition(" is back")[2] for text in said] == back
+
+
+def test_rate_at_which_the_watchdog_would_stop_the_servos_is_refused(here: None) -> None:
+    path = Path("two.yaml")
+    path.write_text(ROBOT)
+    steering = simulated_robot(path, duration_s=0.1).robot.loop.steering
+    assert steering.change_rate(10).text == "the Bus Watchdog needs at least 15 Hz"
+    assert steering.change_rate(50) is None

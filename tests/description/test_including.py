@@ -1,5 +1,5 @@
 # ruff: noqa: E501 (a mistake and its sentence are read best side by side)
-"""Fragments of robot files: what they add, which file wins, and where mistakes are."""
+"""What is put into robot files: arguments, fragments, groups and defaults, each value with its place."""
 
 from __future__ import annotations
 
@@ -13,10 +13,99 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.kit import desk
 from tests.kit.desk import TORSO
+from tests.kit.robots import robot_text
 
 from dxlrun.description.document import KeyPath, confined, grow, literal, parse, read_file
 from dxlrun.description.including import MOST_FILES, MOST_LEVELS, merged
+from dxlrun.description.joints.groups import NAMING, without_groups
+from dxlrun.description.motion import parse_motion
+from dxlrun.description.reading import Description
 from dxlrun.errors import Mark
+
+
+def figures(description: Description) -> tuple[str, float]:
+    """Return port and rate of the torso."""
+    return description.robot.buses["main"].port, description.robot.loop.rate
+
+
+@pytest.mark.parametrize(
+    ("given", "found"),
+    [
+        ({}, ("sim", 50.0)),
+        ({"port": "/dev/ttyUSB0", "rate": "62.5"}, ("/dev/ttyUSB0", 62.5)),
+        ({"port": "5"}, ("5", 50.0)),  # the default is a text, so it stays one
+        ({"port": "sim}\njoints: {evil: 1"}, ("sim}\njoints: {evil: 1", 50.0)),  # no structure is smuggled in
+    ],
+)
+def test_arguments_are_put_in_and_defaults_count_until_then(
+    given: dict[str, str], found: tuple[str, float]
+) -> None:
+    description = desk.robot(TORSO, given)
+    assert figures(description) == found
+    assert description.arguments == {"port": "sim", "rate": "50"} | given
+    assert set(description.robot.joints) == {"swing", "elbow"}
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "found"),
+    [
+        ("rate: ${rate}\n", 'rate: "${rate}"\n', ("sim", 100.0)),  # inside { } YAML itself asks for quotes
+        ("rate: {default: 50, ", "rate: {", ("sim", 100.0)),
+        ('"loop rate, Hz"', '"used as ${rate}"', ("sim", 100.0)),  # help may explain how it is written
+        ('port: "${port}"', 'port: "$${a}/${port}"', ("${a}/sim", 100.0)),  # two dollars write one
+        ('port: "${port}"', 'port: "/dev/tty${rate}"', ("/dev/tty100", 100.0)),  # inside a longer text
+    ],
+)
+def test_use_of_an_argument(right: str, wrong: str, found: tuple[str, float]) -> None:
+    assert right in TORSO
+    assert figures(desk.robot(TORSO.replace(right, wrong), {"rate": "100"})) == found
+
+
+@pytest.mark.parametrize(
+    ("text", "given", "said"),
+    [
+        (TORSO, {"rate": "fast"}, ["robot.yaml:8:9: loop.rate: 'fast' is not a rate (argument rate:=fast); write a rate such as 50, 50 Hz or 1 kHz"]),
+        (TORSO.replace("{bus: main, id: 5, model: AX-12A, reference: 150 deg, direction: 1}", "\n    bus: main\n    id: 5\n    model: AX-12A\n    reference: ${port}\n    direction: 1"), {}, ["robot.yaml:16:16: joints.elbow.reference: 'sim' is not an angle (argument port:=sim); write an angle such as 60 deg or 1.05 rad"]),
+        (TORSO, {"prot": "sim", "x": "1"}, ["command line:1:1: argument prot:=sim is not declared in the robot file; did you mean port?", "command line:1:1: argument x:=1 is not declared in the robot file; known arguments: port, rate"]),
+        (TORSO.replace("rate: ${rate}", "rate: ${rat}"), {}, ["robot.yaml:8:9: argument 'rat' is not declared; did you mean rate?"]),
+        (TORSO.replace("rate: {default: 50, ", "rate: {"), {}, ["robot.yaml:4:3: the argument rate has no value; write rate:=... after the robot file, or give it a default"]),
+        (
+            TORSO.replace("directory: elsewhere", 'directory: "${rate"').replace("${rate}\n", "${a b}\n"),
+            {},
+            ["robot.yaml:8:9: argument 'a b' is not declared; known arguments: port, rate", "robot.yaml:17:24: ${ has no closing }; write ${name}, or $${ for a literal ${"],
+        ),
+    ],
+)  # fmt: skip
+def test_wrong_use_is_reported_where_it_is(text: str, given: dict[str, str], said: list[str]) -> None:
+    assert desk.refusals(text, given) == said
+
+
+@pytest.mark.parametrize(
+    ("block", "problem"),
+    [
+        ("arguments: 5", "2:1: arguments is not a mapping"),
+        ("arguments:", "2:1: arguments is not a mapping"),
+        ("arguments: {a: sim}", "2:16: arguments.a is the text 'sim', but must be a mapping"),
+        ("arguments: {a: {defualt: 1}}", "2:17: arguments.a has an unknown key 'defualt'; did you mean default?"),
+        ("arguments: {a: {default: [1]}}", "2:26: arguments.a.default: the default of an argument must be one value"),
+        ("arguments: {a: {default: 1, help: 5}}", "2:35: arguments.a.help is 5, but must be text"),
+        ("arguments: {a b: {default: 1}}", "2:13: 'a b' is not a valid name of an argument"),
+        ("arguments: {a: {default: '${b}'}}", "2:26: the default of an argument cannot contain ${...}"),
+        ("arguments: {a: {default: 1}, a: {default: 2}}", "2:30: arguments.a is already defined in line 2"),
+    ],
+)  # fmt: skip
+def test_a_wrong_block_is_refused_where_it_stands(block: str, problem: str) -> None:
+    text = f"name: x\n{block}\nbuses: {{m: {{port: sim, protocol: 1.0, baud_rate: 1}}}}\nloop: {{rate: 1}}\n"
+    text += "joints: {j: {bus: m, id: 1, model: A, reference: 0 deg, direction: 1}}\n"
+    (found,) = desk.refusals(text)
+    assert found.startswith(f"robot.yaml:{problem}")
+
+
+def test_without_a_block_there_are_no_arguments() -> None:
+    first, second, *_ = desk.refusals("name: x\nloop: {rate: '${rate}'}\n", {"rate": "1"})
+    assert first.startswith("command line:1:1: argument rate:=1 is not declared in the robot file; remove it")
+    assert "has no" in second
+
 
 HEAD = """\
 arguments:
@@ -211,3 +300,100 @@ def test_merging_is_deep_and_each_value_keeps_the_mark_of_its_file(documents: li
     places = {path[:end] for path in leaves(result.data) for end in range(len(path) + 1)}
     assert set(result.marks.values) == places  # none of what was replaced
     assert set(result.marks.keys) == set(result.marks.values) - {()}
+
+
+ROBOT = robot_text("shared")
+
+
+def test_joints_have_what_they_share() -> None:
+    robot = desk.robot(ROBOT).robot
+    assert list(robot.joints) == ["knee", "shoulder", "elbow"]  # the order of `joints`, which is that of rows
+    assert [joint.bus for joint in robot.joints.values()] == ["right", "left", "left"]
+    assert [joint.direction for joint in robot.joints.values()] == [-1, 1, -1]
+    assert robot.joints["shoulder"].limits.position == (-1.0, 1.0)
+    assert {joint.limits.velocity for joint in robot.joints.values()} == {2.0}
+    assert [joint.registers for joint in robot.joints.values()] == [
+        {"position_p_gain": 800, "position_d_gain": 0},
+        {"position_p_gain": 700, "position_d_gain": 5},
+        {"position_p_gain": 700, "position_d_gain": 0},
+    ]
+
+
+def test_a_group_stands_for_its_joints_wherever_they_are_named() -> None:
+    description = desk.robot(ROBOT)
+    robot = description.robot
+    assert description.groups == {
+        "left": ("shoulder", "elbow"),
+        "right": ("knee",),
+        "body": ("shoulder", "elbow", "knee"),
+    }
+    assert robot.controllers["all_joints"].parameters == {"joints": ["knee", "shoulder", "elbow"]}
+    home = robot.poses["home"]
+    assert home == {"shoulder": 0.0, "knee": 0.0, "elbow": 1.0}
+    groups = {name: group.joints for name, group in robot.policies.groups.items()}
+    assert groups == {"left": ("shoulder", "elbow"), "other": ("knee",)}
+    steps = [{"pose": {"left": 0, "knee": 1}, "torque": {"body": 2}}]
+    assert without_groups({"steps": steps, "into": ["left"]}, description.groups) == {
+        "steps": [
+            {"pose": {"shoulder": 0, "elbow": 0, "knee": 1}, "torque": {"shoulder": 2, "elbow": 2, "knee": 2}}
+        ],
+        "into": ["left"],  # a controller of that name
+    }
+    assert set(NAMING) == {"joints", "pose", "torque"}
+
+
+def test_values_keep_their_places() -> None:
+    description = desk.robot(ROBOT)
+    file, marks = str(description.path), description.marks
+    assert marks.key("joints", "knee", "model") == Mark(file, 5, 3)
+    assert marks.value("joints", "elbow", "registers", "position_p_gain") == Mark(file, 11, 50)
+    assert marks.value("joints", "shoulder", "registers", "position_d_gain") == Mark(file, 16, 87)
+    assert marks.value("controllers", "all_joints", "joints", 0) == Mark(file, 19, 64)
+    assert marks.value("controllers", "all_joints", "joints", 2) == Mark(file, 19, 70)
+    turned = desk.robot(ROBOT.replace("[knee, left]", "[left, knee]")).marks  # one behind a group
+    columns = [turned.value("controllers", "all_joints", "joints", index).column for index in range(3)]
+    assert columns == [64, 64, 70]
+    assert marks.key("poses", "home", "knee") == Mark(file, 21, 10)
+    assert marks.key("poses", "home", "elbow") == Mark(file, 21, 23)
+
+
+def test_motions_name_groups() -> None:
+    groups = desk.robot(ROBOT).groups
+    text = (
+        "name: m\nmotions:\n- controller: all_joints\n  points:\n"
+        "  - {time: 1 s, joints: {left: {position: 0 rad}, knee: {position: 1 rad}}}\n"
+    )
+    motion = parse_motion(text, Path("m.yaml"), groups)
+    assert list(motion.motion.motions[0].points[0].joints) == ["shoulder", "elbow", "knee"]
+    where = motion.marks.key("motions", 0, "points", 0, "joints", "elbow")
+    assert where == Mark("m.yaml", 5, 26)
+
+
+def test_a_joint_of_a_transmission_gets_no_keys_of_a_servo() -> None:
+    wrist = """\
+  pitch: {}
+  roll: {}
+transmissions:
+  wrist:
+    type: differential
+    joints: [hand]
+    servos:
+      a: {bus: left, id: 8, model: XL430-W250, reference: 180 deg, direction: 1}
+      b: {bus: left, id: 9, model: XL430-W250, reference: 180 deg, direction: -1}
+controllers:"""
+    text = ROBOT.replace("controllers:", wrist).replace(
+        "groups:\n", "groups:\n  hand: {bus: left, joints: [pitch, roll]}\n", 1
+    )
+    robot = desk.robot(text).robot
+    assert robot.joints["pitch"].limits.velocity == 2.0
+    assert not hasattr(robot.joints["pitch"], "bus")
+
+
+def test_fragments_share_groups() -> None:
+    desk.write(ROBOT, "pair.yaml")
+    robot = desk.robot(
+        "include: [pair.yaml]\ngroups: {left: {joints: [elbow]}}\njoint_defaults: {model: XL430-W250}\njoints: {shoulder: {bus: right}}\n"
+    ).robot
+    assert robot.groups["left"].joints == ("elbow",)
+    assert {joint.model for joint in robot.joints.values()} == {"XL430-W250"}
+    assert robot.controllers["all_joints"].parameters == {"joints": ["knee", "elbow"]}

@@ -1,31 +1,23 @@
 # ruff: noqa: E501 (a mistake and its sentence are read best side by side)
+"""Motions and motor files in SI units; `cases/motion_form.txt` and `motor_form.txt` have the mistakes."""
 
 from __future__ import annotations
 
 import math
 
 import pytest
+from msgspec.structs import replace
 from tests.kit import desk
+from tests.kit.cases import read_head
 from tests.kit.desk import TORSO
+from tests.kit.robots import CASES
 
+from dxlrun import MotorLoad, MotorModel, Stribeck
+from dxlrun.description.joints.motor_file import MotorForm, UncertaintyForm, motor_text, read_motor
 from dxlrun.description.motion import FormulaPart, PointsPart
 from dxlrun.description.units import Measure
 
-MOTION = """\
-name: wave
-motions:
-  - controller: head
-    start: 500 ms
-    points:
-      - {time: 1 s, joints: {yaw: {position: 90 deg, velocity: 0.5 rad/s}, pitch: {position: 0 rad}}}
-      - {time: 2 s, joints: {yaw: {position: -1 rad, acceleration: 1 rad/s^2}}}
-  - controller: arm
-    duration: 30 s
-    samples: 500
-    joints:
-      elbow: {position: 0.2*(sin(2*t) - sin(4*t)) - 0.4, velocity: cos(t), acceleration: -1}
-      swing: {position: 0}
-"""
+MOTION = read_head(CASES / "motion_form.txt").partition("---- motion0.yaml\n")[2]
 
 
 def test_a_robot_file_is_no_motion_and_a_motion_no_robot() -> None:
@@ -61,35 +53,6 @@ def test_points_and_formulas_become_si_units() -> None:
     assert formulas.joints["swing"].position == "0"
 
 
-DAMAGES = [
-    ("time: 1 s", "time: §1", "motions[0].points[0].time: 1 has no unit; write a duration"),
-    ("position: 90 deg", "position: §90", "motions[0].points[0].joints.yaw.position: 90 has no unit; write an"),
-    ("velocity: 0.5 rad/s", "velocity: §0.5 rad", "motions[0].points[0].joints.yaw.velocity: '0.5 rad' has the wrong unit"),
-    ("{position: 0 rad}", "§{}", "motions[0].points[0].joints.pitch: the target is empty; give it"),
-    ("{time: 2 s, ", "§{", "motions[0].points[1] has no time; add `time: 1 s`"),
-    ("{time: 2 s, ", "{time: 2 s, §tiem: 3, ", "motions[0].points[1] has an unknown key 'tiem'; did you mean time?"),
-    ("start: 500 ms", "§samples: 5", "motions[0].samples is not allowed here; write either points, or"),
-    ("start: 500 ms", "§strat: 1 s", "motions[0] has an unknown key 'strat'; did you mean start?"),
-    ("samples: 500", "samples: §1", "motions[1].samples is 1, but must be at least 2; write"),
-    ("samples: 500", "samples: 500\n    §smaples: 500", "motions[1] has an unknown key 'smaples'; did you mean samples?"),
-    ("controller: arm\n    duration: 30 s", "§controller: arm", "motions[1] has no duration; add `duration: 20 s`"),
-    ("duration: 30 s", "duration: §0 s", "motions[1].duration is 0 s, but must be greater than 0; write"),
-    ("velocity: cos(t)", "velocity: §[t]", "motions[1].joints.elbow.velocity is a list, but must be text; write"),
-    ("{position: 0}", "{position: §true}", "motions[1].joints.swing.position is true, but must be text; put"),
-    ("swing: {position: 0}", "§swing: {velocity: 0}", "motions[1].joints.swing has no position; add"),
-    ("name: wave", "name: §${x}", "this file cannot contain ${...}; write the value"),
-    ("name: wave\n", "§", "the file has no name; add"),
-    ("name: wave\n", "name: wave\n§include: []\n", "the file has an unknown key 'include'; remove it"),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("right", "wrong", "expected"), DAMAGES)
-def test_each_mistake_is_named_where_it_stands(right: str, wrong: str, expected: str) -> None:
-    text, place = desk.pointed(MOTION, right, wrong)
-    (problem,) = desk.motion_refusals(text)
-    assert problem.startswith(f"motion.yaml:{place}: {expected}")
-
-
 def test_a_part_that_is_neither_points_nor_formulas_is_refused() -> None:
     assert len(desk.motion_refusals("name: x\nmotions: [{controller: a}]\n")) == 3
     assert desk.motion_refusals("name: x\nmotions: [5]\n") == [
@@ -99,3 +62,60 @@ def test_a_part_that_is_neither_points_nor_formulas_is_refused() -> None:
     assert desk.motion_refusals("name: x\nmotions: []\n") == [
         "motion.yaml:2:10: motions has too few entries; write at least 1"
     ]
+
+
+MOTOR = read_head(CASES / "motor_form.txt").partition("---- elbow.motor.yaml\n")[2]
+KNOWN = MotorModel(
+    model="MX-64",
+    voltage=12.0,
+    torque_constant=1.6,
+    resistance=3.5,
+    inertia=0.0112,
+    friction=0.1,
+    load_friction=0.08,
+    viscous_friction=0.0006,
+    stribeck=Stribeck(0.05, 0.2, 2.0),
+    position_gain=0.158,
+    p_gain=32,
+    delay_ns=1_500_000,
+    load=MotorLoad(0.004, 0.2, math.pi / 2),
+    source="elbow_20261123.mcap",
+)
+
+
+def test_a_motor_file_becomes_si_units() -> None:
+    read = read_motor(desk.write(MOTOR))
+    assert read.motor == KNOWN
+    assert read.uncertainty == {"resistance": 0.05, "delay": pytest.approx(300e-6)}
+    assert read.motor.stiffness == pytest.approx(5.056)
+    assert replace(read.motor, position_gain=None).stiffness is None
+    assert replace(read.motor, p_gain=None).stiffness == 0.158
+
+
+def test_what_is_written_is_read_again() -> None:
+    known = replace(KNOWN, source="it's: a log #1", voltage=12.3456, friction=1e-5)
+    uncertainty = {
+        "resistance": 0.05,
+        "load_friction": 0.01,
+        "delay": 2e-5,
+        "load_gravity_angle": 0.01,
+        "stribeck_velocity": 0.1,
+        "viscous_friction": 1e-6,
+    }
+    read = read_motor(desk.write(motor_text(known, uncertainty, comment="one\n\ntwo")))
+    assert read.motor == replace(known, load=read.motor.load)
+    assert read.motor.load.gravity_angle == pytest.approx(math.pi / 2, rel=1e-5)
+    assert dict(read.uncertainty) == pytest.approx(uncertainty)
+    assert read.text.startswith("# one\n#\n# two\nmodel: MX-64\n")
+    bare = MotorModel("AX-12A", 12.0, 1.0, 5.0, 0.01)
+    assert read_motor(desk.write(motor_text(bare, {}))).motor == bare
+
+
+def test_every_uncertainty_can_be_written() -> None:
+    values = dict.fromkeys(UncertaintyForm.model_fields, 0.01)
+    assert dict(read_motor(desk.write(motor_text(KNOWN, values))).uncertainty) == pytest.approx(values)
+
+
+def test_each_figure_of_a_motor_is_a_key_of_the_file() -> None:
+    keys = {*MotorForm.model_fields} - {"uncertainty", "delay"} | {"delay_ns", "torque_per_effort"}
+    assert keys == {*MotorModel.__slots__}

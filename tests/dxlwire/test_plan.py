@@ -1,13 +1,29 @@
-"""Plans of buses: bytes, budgets and times of their reads, limits in ticks."""
+"""Plans of buses: bytes, budgets, times and limits; lines that go and come back; the face of dxlwire."""
+
+from __future__ import annotations
+
+import ast
+import doctest
+import os
+import select
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
 
 import msgspec
 import pytest
+from tests.kit.awaited import DEADLINE_S
 from tests.kit.plans import make_plan
 
+import dxlwire
 from dxlwire.bus_plan import BusPlan
 from dxlwire.control_table import find_table, model_names
+from dxlwire.exceptions import PortError
 from dxlwire.plan.line import LONGEST_RETURN_DELAY_NS, TIMEOUT_MARGIN_NS
 from dxlwire.plan.planning import torque_off_ns
+from dxlwire.port import reopening
+from dxlwire.port.reopening import KeptLines, LineSettings, lasting_name
 
 
 @pytest.mark.parametrize(("latency_ms", "total_ms", "rate_hz"), [(1, 14.1, 71), (16, 134, 7)])
@@ -76,3 +92,188 @@ def test_goals_beyond_one_sync_write_are_counted_as_two(model, protocol, most):
     per_servo = goal_bytes(most) - goal_bytes(most - 1)
     assert goal_bytes(most + 1) == goal_bytes(most) + goal_bytes(1)
     assert goal_bytes(2) == goal_bytes(1) + per_servo
+
+
+class Adapter:
+    """A pseudo-terminal behind a link, as udev's are."""
+
+    def __init__(self, link):
+        self.link = link
+        self.master, self._slave = os.openpty()
+        self._point()
+
+    def unplug(self):
+        os.close(self.master)
+        os.close(self._slave)
+        self.link.unlink()
+
+    def plug_in(self):
+        self.master, self._slave = os.openpty()
+        self._point()
+
+    def heard(self):
+        assert select.select([self.master], [], [], DEADLINE_S)[0]
+        return os.read(self.master, 100)
+
+    def _point(self):
+        self.link.symlink_to(os.ttyname(self._slave))
+
+
+@pytest.fixture
+def adapters(tmp_path):
+    both = [Adapter(tmp_path / "left"), Adapter(tmp_path / "right")]
+    yield both
+    for adapter in both:
+        adapter.unplug()
+
+
+@pytest.fixture
+def kept(adapters):
+    lines = KeptLines([LineSettings(str(adapter.link), 1_000_000, 0) for adapter in adapters])
+    yield lines
+    lines.close()
+
+
+def returned(lines):
+    assert select.select([lines], [], [], DEADLINE_S)[0]
+    return [one.index for one in lines.returned()]
+
+
+def test_a_line_that_is_back_under_another_name_has_its_old_descriptor(adapters, kept):
+    before, opened = list(kept.descriptors), len(os.listdir("/proc/self/fd"))
+    adapters[1].unplug()
+    assert kept.lost(1)
+    assert kept.returned() == []
+    adapters[1].plug_in()
+    assert returned(kept) == [1]
+    assert kept.descriptors == before
+    assert len(os.listdir("/proc/self/fd")) == opened
+    os.write(kept.descriptors[1], b"right")
+    assert adapters[1].heard() == b"right"
+    os.write(kept.descriptors[0], b"left")
+    assert adapters[0].heard() == b"left"
+
+
+def test_while_a_line_is_gone_nobody_has_its_old_device_open(adapters, kept):
+    adapters[0].unplug()
+    kept.lost(0)
+    assert os.readlink(f"/proc/self/fd/{kept.descriptors[0]}") == os.devnull
+    adapters[0].plug_in()
+    assert returned(kept) == [0]
+
+
+def test_a_line_is_back_soon_after_its_adapter(adapters, kept, monkeypatch):
+    pauses = []
+
+    def sleep(pause_s):
+        pauses.append(pause_s)
+        if sum(pauses) > 10.0 and not adapters[0].link.exists():
+            adapters[0].plug_in()
+
+    monkeypatch.setattr(reopening, "time", SimpleNamespace(sleep=sleep))
+    adapters[0].unplug()
+    kept.lost(0)
+    assert returned(kept) == [0]
+    assert 10.0 < sum(pauses) <= 10.0 + reopening.LONGEST_PAUSE_S
+
+
+def test_both_lines_may_be_gone_at_once_and_come_back_in_any_order(adapters, kept):
+    for index in (0, 1):
+        adapters[index].unplug()
+        kept.lost(index)
+    adapters[1].plug_in()
+    assert returned(kept) == [1]
+    adapters[0].plug_in()
+    assert returned(kept) == [0]
+
+
+def test_a_line_that_is_gone_for_long_is_tried_each_two_seconds(adapters, kept, monkeypatch):
+    pauses = []
+
+    def pause(seconds):
+        pauses.append(seconds)
+        if len(pauses) == 9:
+            adapters[0].plug_in()
+
+    monkeypatch.setattr("dxlwire.port.reopening.time.sleep", pause)
+    adapters[0].unplug()
+    kept.lost(0)
+    assert returned(kept) == [0]
+    assert (max(pauses), pauses[-1]) == (2.0, 2.0)
+
+
+def test_a_line_that_is_back_is_locked_against_every_other_program(adapters, kept):
+    adapters[0].unplug()
+    kept.lost(0)
+    adapters[0].plug_in()
+    returned(kept)
+    with pytest.raises(PortError, match="in use"):
+        KeptLines([LineSettings(str(adapters[0].link), 1_000_000, 0)])
+
+
+def test_of_two_lines_of_which_one_is_missing_neither_is_kept(adapters):
+    left = str(adapters[0].link)
+    with pytest.raises(PortError, match="port /dev/ttyNOPE not found"):
+        KeptLines([LineSettings(left, 1_000_000, 0), LineSettings("/dev/ttyNOPE", 1_000_000, 0)])
+    KeptLines([LineSettings(left, 1_000_000, 0)]).close()
+
+
+def test_the_name_by_which_an_adapter_is_found_again(tmp_path):
+    device, stranger = tmp_path / "ttyUSB0", tmp_path / "ttyUSB1"
+    device.touch()
+    (tmp_path / "by-id").mkdir()
+    link = tmp_path / "by-id/usb-FTDI_FT9HDA1"
+    link.symlink_to(device)
+    assert lasting_name(str(device), tmp_path) == str(link)
+    assert lasting_name(str(link), tmp_path) == str(link)
+    assert lasting_name(str(stranger), tmp_path) == str(stranger)
+    assert lasting_name("/dev/pts/7", tmp_path) == ""
+
+
+README = Path(dxlwire.__file__).with_name("README.md")
+OWN = Path(__file__).parent
+KIT = [OWN.parent / f"kit/{name}.py" for name in ("cases", "exchanges", "plans")]
+
+
+def test_every_public_name_exists() -> None:
+    assert dxlwire.__all__
+    for name in dxlwire.__all__:
+        assert getattr(dxlwire, name) is not None
+    assert set(dxlwire.__all__) <= set(dir(dxlwire))
+    with pytest.raises(AttributeError, match="has no attribute 'robots'"):
+        dxlwire.robots  # noqa: B018  the access is what raises
+
+
+def test_examples_of_docstring_and_readme_are_right() -> None:
+    assert doctest.testmod(dxlwire).failed == 0
+    result = doctest.testfile(str(README), module_relative=False)
+    assert result.failed == 0
+    assert result.attempted > 5
+
+
+def test_import_loads_neither_numpy_nor_dxlrun() -> None:
+    code = """
+import sys, dxlwire
+assert not {"numpy", "msgspec"} & set(sys.modules)
+for name in dxlwire.__all__:
+    getattr(dxlwire, name)
+import dxlwire.exchange.kernel, dxlwire.exchange.idle, dxlwire.plan.planning, dxlwire.port.reopening
+print(sorted(name for name in sys.modules if name.split(".")[0] in ("dxlrun", "dxlsim", "pydantic")))
+"""
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout == "[]\n"
+
+
+def test_tests_of_dxlwire_need_neither_runtime_nor_simulation() -> None:
+    found: dict[str, set[str]] = {}
+    for path in (*OWN.rglob("*.py"), *KIT):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                names = {one.name for one in node.names}
+            else:
+                names = {node.module or ""} if isinstance(node, ast.ImportFrom) else set()
+            found.setdefault(path.name, set()).update(names)
+    own = {name for names in found.values() for name in names if name.split(".")[0] in ("dxlrun", "dxlsim")}
+    assert own == set()
+    kit = {name for names in found.values() for name in names if name.startswith("tests.")}
+    assert kit == {"tests.kit.awaited", "tests.kit.cases", "tests.kit.exchanges", "tests.kit.plans"}

@@ -1,36 +1,52 @@
-"""`dxlrun setup` with a scripted hand that connects simulated servos, on virtual time; and finding a port.
-
-Most of its dialogues are in dialogues/setup.txt.
-"""
+"""Dialogues with a scripted hand on simulated servos and virtual time, most of them texts; finding a port."""
 
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import pytest
 from tests.kit.cases import TextCase, case_parameters, read_head
-from tests.kit.dialogues import check_dialogue
+from tests.kit.dialogues import Dialogue, check_dialogue
 from tests.kit.hands import HandLine, Script, interrupt, written
 
 from dxlrun.description.reading import read_robot
 from dxlrun.dynamixel.tools.one_servo import OneServo
+from dxlrun.dynamixel.tools.tool_port import TunablePort
 from dxlrun.errors import PortError
 from dxlrun_hand.commands.setup import set_up
 from dxlrun_hand.lines import find_port
 from dxlrun_hand.servo_setup import ServoSetup
 from dxlsim.simulation_plan import ServoConfig
 from dxlsim.virtual_ports import VirtualPorts
+from dxlwire.port.serial_open import open_serial
 
-TEXT = Path(__file__).parent / "dialogues" / "setup.txt"
-ROBOT = read_head(TEXT).partition("----\n")[0]
+DIALOGUES = Path(__file__).with_name("dialogues")
+ROBOT = read_head(DIALOGUES / "setup.txt").partition("----\n")[0]
 NEW = (ServoConfig(1, "XL430-W250", math.radians(150)), ServoConfig(1, "XM430-W350", math.radians(200)))
 
 
-@pytest.mark.parametrize("told", case_parameters(TEXT))
+@pytest.mark.parametrize("told", case_parameters(DIALOGUES))
 def test_dialogue(tmp_path: Path, capsys: pytest.CaptureFixture[str], told: TextCase) -> None:
     check_dialogue(tmp_path, told, lambda: capsys.readouterr().err)
+
+
+def test_a_port_that_another_program_has_is_refused(tmp_path: Path) -> None:
+    robot, servos = read_head(DIALOGUES / "calibrate.txt").split("----\n")
+    master, slave = os.openpty()
+    case = Dialogue(tmp_path, robot.replace("/dev/null", os.ttyname(slave)), servos, ["run calibrate"])
+    held = open_serial(os.ttyname(slave), 57600)
+    try:
+        case.line.open = TunablePort
+        case.perform()
+    finally:
+        held.close()
+        os.close(master)
+        os.close(slave)
+    assert "is in use by" in case.error
+    assert case.path.read_bytes() == case.before
 
 
 class Bench:

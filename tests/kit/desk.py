@@ -45,18 +45,6 @@ def motion_refusals(text: str) -> list[str]:
     return caught(lambda: read_motion(path))
 
 
-def pointed(text: str, right: str, wrong: str) -> tuple[str, str]:
-    """Return the text with `wrong` instead of `right`, and the line and column at which its § points."""
-    assert right in text
-    return marked(text.replace(right, wrong, 1))
-
-
-def marked(text: str) -> tuple[str, str]:
-    """Return a text without its §, and the line and column at which that points."""
-    before, _, after = text.partition("§")
-    return before + after, f"{before.count(chr(10)) + 1}:{len(before) - before.rfind(chr(10))}"
-
-
 def caught(read: Callable[[], object]) -> list[str]:
     """Return the problems that reading raises."""
     with pytest.raises(InputError) as found:

@@ -1,15 +1,28 @@
-"""Requests for joints of several servos: each becomes one for every servo, and is answered once by all."""
+"""Requests for joints of several servos, layers between joints and servos, and limits of one servo."""
+
+from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
 
+import numpy as np
 import pytest
 from msgspec.structs import replace
 from tests.kit.rigs import Events
+from tests.kit.stories import replayed, send, tell
+from tests.kit.wire import all_writes
 
+from dxlrun import features
 from dxlrun.channels.cycle import Commands, States, Torque
-from dxlrun.channels.event_records import EventCode
+from dxlrun.channels.event_records import EventCode, EventSink
+from dxlrun.contract.hardware import Hardware
+from dxlrun.dynamixel.hardware_layer import HardwareLayer, HardwareLayers, LayerStage, PreparedLayer
+from dxlrun.features.feature import Feature, S
 from dxlrun.features.mechanics.joint_arrays import CoupledJointArrays
 from dxlrun.features.mechanics.joint_hardware import CouplingCheck, JointHardware
+from dxlrun.plan.robot_plan import Plan
+from dxlrun.testing import VirtualRobot, simulated_robot
 from dxlwire.modes import Mode
 
 HIP, PITCH = 1, 3
@@ -188,3 +201,143 @@ def test_servos_that_are_given_torque_apart_keep_their_places_and_then_agree(joi
     for _ in range(50):  # 20 ms each
         joints.hardware.write_goals()
     assert goals[HIP_SERVOS] == pytest.approx([0.22, 0.22])
+
+
+OFFSET = 0.1
+ROBOT = """\
+name: pair
+buses:
+  main: {port: sim, protocol: 2.0, baud_rate: 1_000_000, return_delay_time: 0 us, adapter: {kind: direct}}
+loop: {rate: 50}
+joints:
+  pan: {bus: main, id: 1, model: XL430-W250, reference: 180 deg, direction: 1}
+  tilt: {bus: main, id: 2, model: XL430-W250, reference: 180 deg, direction: 1}
+controllers:
+  arm: {type: joint_group_position_controller, joints: [pan, tilt]}
+"""
+MOTION = """\
+name: move
+motions:
+  - controller: arm
+    points:
+      - {time: 0 s, joints: {pan: {position: 0.5 rad}, tilt: {position: 0 rad}}}
+"""
+
+
+class OffsetLayer(HardwareLayer):
+    """Adds an offset to the position goals of joints from their first motion on."""
+
+    def __init__(self, hardware: Hardware, above: Commands, below: Commands) -> None:
+        super().__init__(hardware)
+        self.above, self.below = above, below
+        self.first = np.full(above.position.shape, np.nan)
+
+    def start(self, engaging: Callable[[], None] = lambda: None) -> None:
+        super().start(engaging)
+        self.above.values[:] = self.below.values
+        self.first[:] = self.above.position
+
+    def write_goals(self) -> None:
+        self.below.values[:] = self.above.values
+        self.below.position[self.above.position != self.first] += OFFSET
+        super().write_goals()
+
+    def follow_goals(self, rows: Sequence[int]) -> None:
+        self.first[list(rows)] = self.above.position[list(rows)]
+        super().follow_goals(rows)
+
+
+def prepare_offset(plan: Plan, states: States, goals: Commands, events: EventSink) -> PreparedLayer | None:
+    """Return the layer for every robot."""
+    below = Commands.empty(len(plan.loop.joints))
+    return PreparedLayer(states, below, lambda hardware: OffsetLayer(hardware, goals, below))
+
+
+class OffsetFeature(Feature):
+    """A feature that has a layer only."""
+
+    def stage(self, kind: type[S]) -> S | None:
+        found = LayerStage(prepare_offset)
+        return found if isinstance(found, kind) else None
+
+
+@pytest.fixture
+def with_offset(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Register the layer next to the loop."""
+    monkeypatch.setattr(features, "FEATURES", (OffsetFeature("offset", ""), *features.FEATURES))
+    monkeypatch.setattr(features, "_installed", features._installed.__wrapped__)
+
+
+def _moved(tmp_path: Path, log: Path | None = None) -> tuple[float, float]:
+    """Return goal and position of a joint that was sent to 0.5 rad."""
+    path, motion = tmp_path / "pair.yaml", tmp_path / "motion.yaml"
+    path.write_text(ROBOT)
+    motion.write_text(MOTION)
+    robot = simulated_robot(path, play=[motion], duration_s=2.0, log=log)
+    robot.run()
+    return float(robot.record.goals.position[0]), float(robot.record.states.position[0])
+
+
+def test_layer_changes_what_servos_get_and_no_record(with_offset, tmp_path):
+    goal, position = _moved(tmp_path, tmp_path / "run.mcap")
+    assert goal == pytest.approx(0.5, abs=1e-6)
+    assert position == pytest.approx(0.5 + OFFSET, abs=0.01)
+    replayed(tmp_path / "run.mcap")
+
+
+def test_layer_above_the_mechanics_has_rows_of_joints(with_offset, plan):
+    coupled = plan()
+    states, goals = States.empty(5), Commands.empty(5)
+    layers = HardwareLayers(coupled, states, goals, lambda *_: None)
+    assert len(layers.goals.position) == len(coupled.mechanics.servos) > 5
+    assert layers.refusals is not None
+    built = layers.build(HardwareLayer(None))
+    assert isinstance(built, OffsetLayer)
+    assert built.above is goals
+    assert isinstance(built._hardware, JointHardware)
+
+
+GOAL_CURRENT, GOAL_VELOCITY = 102, 104
+POSITIONS = "  all: {type: joint_group_position_controller, joints: [head, hip, gripper, pitch, roll]}"
+
+
+def run(
+    plan: Callable[..., Plan], tmp_path: Path, controller: str, command: tuple[str, float], **registers: int
+) -> tuple[list[str], dict[int, set[int]]]:
+    """Command a joint while servos 3 and 5 have these registers; return the events and the goals by servo."""
+    plan((POSITIONS, f"  c: {controller}"))
+    robots: list[VirtualRobot] = []
+
+    def set_registers(robot: VirtualRobot) -> None:
+        robots.append(robot)
+        for servo in (3, 5):
+            for name, value in registers.items():
+                robot.buses[0].servo(servo).registers[name] = value
+
+    story = {number: [send("c", *command)] for number in range(10, 14)}
+    log = replayed(tell(tmp_path / "body.yaml", story, tmp_path / "run.mcap", before=set_registers))
+    goals: dict[int, set[int]] = {}
+    address = GOAL_CURRENT if command[0] == "efforts" else GOAL_VELOCITY
+    size = 2 if address == GOAL_CURRENT else 4
+    for _, servo, begin, data in all_writes(tuple(robots[0].ledger.entries), robots[0].plan.buses[0]):
+        if begin == address and len(data) >= size:
+            goals.setdefault(servo, set()).add(int.from_bytes(data[:size], "little", signed=True))
+    return [event.text for event in log.events if event.code == EventCode.GATE], goals
+
+
+def test_two_servos_of_a_joint_give_what_the_weaker_one_may(plan, tmp_path):
+    effort = "{type: joint_group_effort_controller, joints: [hip]}"
+    texts, goals = run(plan, tmp_path, effort, ("efforts", 0.3), current_limit=20)
+    assert max(map(abs, goals[2])) == max(map(abs, goals[3])) == 20
+    held = "goal clamped by register Current Limit (38) = 20, 0.0538 A (ID 3 on bus main)"
+    assert texts[0] == f"hip, controller c: {held}"
+
+
+@pytest.mark.parametrize(("speed", "held"), [(80.0, True), (60.0, False)])
+def test_a_joint_of_a_differential_is_as_fast_as_the_slower_servo_may(plan, tmp_path, speed, held):
+    velocity = "{type: joint_group_velocity_controller, joints: [pitch, roll]}"
+    command = ("velocities", math.radians(speed), 0.0)
+    texts, goals = run(plan, tmp_path, velocity, command, velocity_limit=50)
+    assert (max(map(abs, goals[5])) == 50) == held
+    named = [text for text in texts if "Velocity Limit (44) = 50, 68.7 deg/s (ID 5 on bus main)" in text]
+    assert len(named) == held

@@ -1,13 +1,35 @@
-"""Names and numbers of models, tables of plug-ins, and files that extend another one."""
+"""Names and numbers of models, tables of servos and devices from files, and mistakes in them."""
 
 from __future__ import annotations
 
+import math
+import re
+import tomllib
 from pathlib import Path
 
 import pytest
+import rustypot
+from tests.kit.cases import TextCase, case_parameters, read_head
 
 import dxlwire.control_table
-from dxlwire.control_table import add_control_table, find_table, model_names, models_by_number, servo_models
+from dxlwire.control_table import (
+    ControlItem,
+    add_control_table,
+    decoded,
+    device_models,
+    find_table,
+    model_names,
+    models_by_number,
+    read_control_table,
+    servo_models,
+)
+from dxlwire.control_table.device_models import (
+    add_device_table,
+    device_table,
+    device_tables,
+    devices_by_number,
+)
+from dxlwire.control_table.device_table import read_device_table
 from dxlwire.control_table.table_files import resolve
 
 AX_12A = Path(dxlwire.control_table.__file__).parent / "tables/protocol1/AX-12A.toml"
@@ -135,3 +157,178 @@ def test_a_file_takes_over_what_it_does_not_say() -> None:
 def test_a_file_that_extends_nothing_or_itself_is_refused(entries: dict[str, dict[str, str]]) -> None:
     with pytest.raises(ValueError, match="is not another control table"):
         resolve("a", entries)
+
+
+AX = find_table("AX-12A")
+AX_TEXT = (Path(dxlwire.control_table.__file__).parent / "tables/protocol1/AX-12A.toml").read_text("utf-8")
+
+
+def test_the_model_number_is_that_of_a_foreign_list() -> None:
+    assert AX.model_number in rustypot.AxPyController.models().values()
+    assert AX.items["model_number"].initial == AX.model_number
+
+
+def test_units_are_exact_and_not_the_rounded_ones_of_the_manual() -> None:
+    assert math.degrees(AX.rad_per_tick) == pytest.approx(300 / 1023, rel=1e-15)
+    assert math.degrees(AX.rad_per_tick * AX.max_tick) == pytest.approx(300, rel=1e-15)
+    assert AX.rad_s_per_tick == pytest.approx(0.111 * 2 * math.pi / 60, rel=1e-15)
+    assert AX.max_speed == pytest.approx(59 * 2 * math.pi / 60, rel=1e-15)
+    rpm = AX.max_speed_tick * AX.rad_s_per_tick * 60 / (2 * math.pi)
+    assert round(rpm) == 114  # e-Manual, Moving Speed (32): "If it is 1023, it is about 114rpm"
+    assert AX.effort_per_tick == 1 / 1023
+    units = {
+        "present_voltage": ("V", 0.1),
+        "present_temperature": ("degC", 1.0),
+        "return_delay_time": ("s", 2e-6),
+        "goal_position": ("rad", AX.rad_per_tick),
+        "torque_enable": ("", 1.0),
+    }
+    assert {name: (AX.items[name].unit, AX.items[name].scale) for name in units} == units
+
+
+def test_a_zero_with_direction_is_zero() -> None:
+    assert AX.items["present_load"].decode(b"\x00\x04") == 0  # e-Manual: "1024 is equal to 0"
+
+
+@pytest.mark.parametrize(("name", "ticks"), [("goal_position", -1), ("id", 256), ("present_speed", 1024)])
+def test_a_value_that_does_not_fit_is_refused_by_name(name: str, ticks: int) -> None:
+    with pytest.raises(ValueError, match=name):
+        AX.items[name].encode(ticks)
+
+
+def test_only_items_that_lie_whole_in_the_bytes_are_decoded() -> None:
+    items = find_table("XM430-W350", 2.0).items
+    assert decoded(items.values(), 80, b"\1\0\2\0\3") == {"position_d_gain": 1, "position_i_gain": 2}
+    assert decoded([items["position_d_gain"]], 81, b"\0\0\0") == {}
+
+
+def test_a_reply_of_the_wrong_length_is_refused() -> None:
+    with pytest.raises(ValueError, match="2 bytes are needed, 1 were given"):
+        AX.items["goal_position"].decode(b"\x00")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "complaint"),
+    [
+        ("address = 3,", "address = 2,", "id: address 2 overlaps the previous item"),
+        ("maximum = 253", "maximum = 256", "id: 0..256 does not fit"),
+        ("initial = 250", "initial = 255", "return_delay_time: the initial value 255"),
+        ('"unsigned"', '"gray"', "model_number: encoding: Invalid enum value 'gray'; known are unsigned"),
+        ("address = 5,", 'address = "5",', "return_delay_time: address: Expected `int`, got `str`"),
+        ("size = 2", "size = 3", "model_number: the size must be 1, 2 or 4, not 3"),
+        ("59 rpm", "59 turns", "the unit is not one of"),
+    ],
+)
+def test_a_broken_data_file_is_refused(old: str, new: str, complaint: str) -> None:
+    assert old in AX_TEXT
+    with pytest.raises(ValueError, match=complaint):
+        read_control_table(AX_TEXT.replace(old, new, 1))
+
+
+def test_items_of_devices_have_integers_bytes_and_values() -> None:
+    meters = "sign_magnitude", "m", 0.5, ""
+    signed = ControlItem("x", 0, 2, "RW", "RAM", -1023, 1023, None, *meters, offset=3.0)
+    assert signed.wire_bytes(-5) == b"\x05\x04"
+    assert (signed.integer(b"\x05\x04"), signed.value(b"\x05\x04")) == (-5, 0.5)
+    button = ControlItem("b", 0, 1, "R", "RAM", 0, 255, None, "unsigned", "", 1.0, "", bit=2)
+    assert [(button.integer(data), button.value(data)) for data in (b"\x04", b"\xfb")] == [(1, 1.0), (0, 0.0)]
+    real = ControlItem("f", 0, 4, "RW", "RAM", 0, 2**32 - 1, None, "float32", "m", 2.0, "")
+    assert (real.integer(b"\0\0\x80\x3e"), real.value(b"\0\0\x80\x3e")) == (0x3E800000, 0.5)
+
+
+TEXT = Path(__file__).with_name("device_mistakes.txt")
+BOARD = read_head(TEXT)
+
+
+@pytest.fixture(autouse=True)
+def _no_added_tables(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(device_models, "_ADDED", [])
+
+
+def test_a_table_without_a_model_number_is_one_that_is_not_checked() -> None:
+    table = read_device_table(BOARD.replace("model_number = 60_001\n", ""))
+    assert table.model_number is None
+
+
+@pytest.mark.parametrize("case", case_parameters(TEXT))
+def test_a_mistake_is_named(case: TextCase) -> None:
+    ((_, sentence, _),) = case.lines
+    before, _, after = case.name.replace("\\n", "\n").partition(" => ")
+    assert before in BOARD
+    with pytest.raises(ValueError, match=re.escape(sentence)):
+        read_device_table(BOARD.replace(before, after, 1))
+
+
+NO_ALIAS = {'aliases = ["BOARD"]\n': ""}
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"Board-1": "board", "60_001": "60_002"}, "a name of board is already used by the device Board-1"),
+        ({"Board-1": "Board-2"} | NO_ALIAS, "number 60001 of Board-2 is already used by the device Board-1"),
+        ({"Board-1": "AX12", "60_001": "60_002"} | NO_ALIAS, "AX12 is already the name of a servo model"),
+        ({"Board-1": "Board-3", "60_001": "1020"} | NO_ALIAS, "is already used by the servo XM430-W350"),
+    ],
+)
+def test_names_and_numbers_belong_to_one_model(changes: dict[str, str], sentence: str) -> None:
+    add_device_table(BOARD)
+    other = BOARD
+    for before, after in changes.items():
+        other = other.replace(before, after)
+    with pytest.raises(ValueError, match=sentence):
+        add_device_table(other)
+    assert add_device_table(BOARD) is device_table("BOARD"), "a process may load its plug-ins twice"
+
+
+def test_our_own_tables_are_whole() -> None:
+    """Each has its source for every item, and no name or number twice."""
+    tables = device_tables()
+    assert len({table.model for table in tables}) == len(tables)
+    for table in tables:
+        others = [each for each in tables if each is not table]
+        device_models._refuse_twins(table, others)
+        assert table.cyclic, table.model
+        states = [table.items[name].state for name in table.cyclic]
+        assert len(set(states)) == len(states), table.model
+        for item in table.items.values():
+            assert item.page or table.model == "generic", (table.model, item.name)
+
+
+def test_a_broken_text_is_no_table() -> None:
+    with pytest.raises(tomllib.TOMLDecodeError):
+        add_device_table("kind = ")
+    with pytest.raises(ValueError, match="the entry 'items' is missing"):
+        add_device_table('kind = "device"')
+
+
+@pytest.mark.parametrize(
+    ("model", "name", "raw", "value"),
+    [
+        ("CM-730", "gyro_x", 512, 0.0),
+        ("CM-730", "gyro_x", 1023, math.radians(499.0234375)),
+        ("CM-740", "acc_z", 640, 9.80665),
+        ("CM-740", "present_voltage", 121, 12.1),
+        ("OpenCR", "gyro_y", -16400, math.radians(-1000)),
+        ("OpenCR", "acc_z", 16384, 9.80665),
+        ("OpenCR", "yaw", -1800, -math.pi),
+        ("bitbots-core", "vdxl", 776, 15.0046875),
+        ("bitbots-core", "current", 776, (776 * 3.3 / 1024 - 2.5) / -0.066),
+        ("bitbots-core", "current", 650, (650 * 3.3 / 1024 - 2.5) / -0.066),
+        ("OP-FSR", "fsr_2", 9800, 9.8),
+    ],
+)
+def test_units_are_those_of_the_sources(model: str, name: str, raw: int, value: float) -> None:
+    """By the formulas of the documents: 512 of 1023 is rest, 16.4 ticks a degree per second."""
+    item = device_table(model).items[name]
+    assert item.value(item.encode(raw)) == pytest.approx(value, abs=1e-6)
+
+
+def test_boards_are_found_by_name_and_by_number() -> None:
+    for name in ("CM-730", "cm740", "OPEN-CR", "opencr", "BitFoot", "wolfgang core", "bitbots_imu"):
+        assert device_table(name).model
+    assert [each.model for each in devices_by_number(0x7400, 1.0)] == ["CM-740"]
+    assert [each.model for each in devices_by_number(0x7400, 2.0)] == ["OpenCR"]
+    assert devices_by_number(0, 2.0) == (), "the foot's number is none"
+    with pytest.raises(LookupError, match=r"uses Protocol 1\.0, not Protocol 2\.0"):
+        device_table("CM-730", 2.0)
