@@ -13,7 +13,7 @@ from tests.kit.wire import all_writes
 
 from dxlrun.channels.answers import Answer, Completion
 from dxlrun.channels.commands import CommandMessage
-from dxlrun.channels.cycle import Floats, Torque
+from dxlrun.channels.cycle import Floats
 from dxlrun.channels.event_records import EventCode
 from dxlrun.log.log_reader import Log, read_log
 from dxlrun.testing import VirtualRobot, simulated_robot
@@ -111,8 +111,3 @@ def changes_of(values: Iterable[int]) -> Iterator[int]:
         if value != before:
             yield value
         before = value
-
-
-def torque_of(log: Log, joint: str) -> list[Torque]:
-    """Return what a joint's torque was, each once in order."""
-    return [*map(Torque, changes_of(log.cycles["torque"][:, log.joints.index(joint)].tolist()))]

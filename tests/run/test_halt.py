@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tests.kit.sampled_run import SampledRun, texts
-from tests.kit.stories import ask, prepared, send, switch
+from tests.kit.sampled_run import SampledRun
+from tests.kit.stories import ask, send
 
 from dxlrun.channels.answers import Code, Completion, Halted, Refusal
-from dxlrun.channels.event_records import EventCode
 from dxlrun.control.halt import HALT_NS, STILL_NS, STILL_SPEEDS
 from dxlrun.log.log_reader import Log
 from dxlwire.joint_unit import ROTARY
@@ -114,22 +113,6 @@ def test_a_goal_far_ahead_of_a_slow_joint_comes_back_to_it(halted):
     assert goals[-1] == pytest.approx(states[row], abs=0.05)
 
 
-def test_a_halted_robot_goes_on_when_a_controller_is_activated(tmp_path):
-    again = [switch(["a"]), send("a", "positions", -0.5)]
-    run = Halts(tmp_path, {1.2: GO, 1.6: [HALT], 2.4: again}, seconds=4.0)
-    log = run.run()
-    assert run.is_done()
-    assert log.cycles["position"][-1, RAMPED] == pytest.approx(-0.5, abs=0.05)
-    assert "halt from anna" in texts(log, EventCode.STEERED)
-
-
-def test_two_halts_are_answered_and_one_of_a_standing_robot_at_once(tmp_path):
-    run = Halts(tmp_path, {1.5: [HALT, HALT]})
-    run.run()
-    assert run.is_done()
-    assert run.halted(1.5)
-
-
 def test_a_joint_that_cannot_stop_is_named(tmp_path, monkeypatch):
     monkeypatch.setattr("dxlrun.control.halt.STILL_SPEEDS", dict.fromkeys(STILL_SPEEDS, -1.0))
     run = Halts(tmp_path, {1.2: [*GO, HALT]}, seconds=1.4 + HALT_NS * 1e-9)
@@ -152,12 +135,6 @@ def test_a_joint_that_does_not_answer_is_not_taken_for_one_that_stands(tmp_path)
     assert isinstance(answer, Refusal)
     assert answer.code == Code.STILL_MOVING
     assert "slow" in answer.fields["joint"]
-
-
-def test_a_halt_that_the_end_of_the_run_interrupts_is_refused(tmp_path):
-    run = Halts(tmp_path, {1.2: GO, 1.48: [HALT]}, seconds=1.5)
-    run.run()
-    assert run.answer(run.numbers[1.48]) == Refusal(Code.RUN_ENDING)
 
 
 def test_goals_that_still_decelerate_are_waited_for_also_where_the_joint_is_slow(tmp_path):
@@ -191,41 +168,3 @@ def test_a_run_that_ends_holding_brakes_within_the_limits_and_waits_until_its_jo
     speeds = wheel_speeds(run)
     assert np.abs(np.diff(speeds)).max() <= 8.0 * DT + 1.1 * RAD_S_PER_TICK
     assert (max(speeds) > 2.0, speeds[-1]) == (True, 0.0)
-
-
-CHAIN = """\
-name: chain
-buses:
-  main: {port: sim, protocol: 2.0, baud_rate: 1_000_000}
-loop: {rate: 100}
-joints:
-  arm: {bus: main, id: 1, model: XM430-W350, reference: 180 deg, direction: 1,
-        limits: {acceleration: 10 rad/s^2}}
-controllers:
-  joint_state_broadcaster: {type: joint_state_broadcaster}
-  pid: {type: pid_controller, joints: [arm], reference: position, command_interface: velocity,
-        gains: {p: 5.0}}
-  arm: {type: joint_trajectory_controller, joints: [arm], into: [pid]}
-"""
-
-
-def test_a_chain_is_halted_whole_and_its_goal_ends_as_aborted(tmp_path):
-    run = SampledRun(tmp_path, CHAIN, 3.0)
-    point = {"time": 2.0, "positions": [1.0]}
-    run.ask(1200, prepared(run.robot, "arm", "trajectory", points=[point]))
-    number = run.ask(1900, HALT)
-    log = run.run()
-    answer = run.answer(number)
-    assert isinstance(answer, Completion)
-    assert answer.halted is not None
-    assert [one.source for one in log.events if one.code == EventCode.CONTROLLER_DEACTIVATED][:2] == [
-        "arm",
-        "pid",
-    ]
-    (ended,) = texts(log, EventCode.GOAL_ENDED)
-    assert "aborted" in ended
-    halted_at = at(log, 1.9 + answer.halted.seconds)
-    assert not np.any(log.cycles["active"][halted_at:] & 0b110)
-    assert 0.05 < log.cycles["position"][-1, 0] < 0.9
-    speeds = [value * RAD_S_PER_TICK for when, value in run.goals("arm", GOAL_VELOCITY, 4) if when > 1200]
-    assert np.abs(np.diff(speeds)).max() <= 10.0 * DT + 1.1 * RAD_S_PER_TICK
