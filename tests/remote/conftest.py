@@ -8,11 +8,12 @@ from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import msgspec
 import numpy as np
 import pytest
+from pydantic import Field, model_validator
 from tests.kit.cases import read_head
 
 import dxlrun
@@ -100,6 +101,48 @@ class Arm(dxlrun.Controller[ArmParameters]):
         pass
 
 
+class Gains(dxlrun.ParametersModel):
+    p: Annotated[float, Field(ge=0, le=10, description="u/e"), dxlrun.LIVE] = 1.0
+    joint: Annotated[dict[str, float], dxlrun.LIVE] = Field({"pan": 0.5})
+    d: float = 0.0
+
+
+class GoalParameters(dxlrun.ParametersModel):
+    joints: tuple[str, ...]
+    speed: Annotated[dxlrun.AngularVelocity, dxlrun.LIVE] = 1.0
+    careful: Annotated[bool, dxlrun.LIVE] = False
+    steps: Annotated[int, dxlrun.LIVE] = 3
+    gains: Gains = Gains()
+
+    @model_validator(mode="after")
+    def _together(self):
+        if self.careful and self.speed > 2:
+            raise ValueError("a careful arm has a speed of at most 2 rad/s")
+        return self
+
+
+class GoalArm(dxlrun.Controller[GoalParameters]):
+    """Takes goals, and has live parameters."""
+
+    Parameters = GoalParameters
+    Commands: ClassVar = {"go": Go, "nudge": Go}
+    Goals: ClassVar = frozenset({"go"})
+
+    @classmethod
+    def interfaces(cls, parameters, joints):
+        return dxlrun.Interfaces(joints=parameters.joints, command=("position",))
+
+    @classmethod
+    def prepare(cls, kind, command, parameters):
+        return np.array([parameters.speed, *command.positions])
+
+    def on_goal(self, goal, data, time_ns):
+        pass
+
+    def update(self, time_ns, period_ns):
+        pass
+
+
 class Points(dxlrun.CommandModel):
     points: list[dict[str, float | list[float]]]
     start_in: float
@@ -131,7 +174,8 @@ class Whole(dxlrun.Controller[dxlrun.ParametersModel]):
 
 @cache
 def plugins():
-    own = {name: Offer(name, cls, "tests 1") for name, cls in (("arm", Arm), ("whole", Whole))}
+    types = {"arm": Arm, "goal_arm": GoalArm, "whole": Whole}
+    own = {name: Offer(name, cls, "tests 1") for name, cls in types.items()}
     return PlugIns({**load_plugins().controllers, **own}, {}, drivers=load_plugins().drivers)
 
 
