@@ -16,6 +16,9 @@ class SimulationJob(msgspec.Struct, frozen=True):
     core: int = -1  # Core to run on; -1: any
     shafts: int = -1  # Descriptor of the slot for the motion of the shafts; -1: none
     progress: int = -1  # Descriptor of the memory for the progress of the process; -1: none
+    carriers: tuple[int, ...] = ()
+    """Descriptors of sockets that carry the bytes of the buses in place of their terminals; empty: the
+    terminals do."""
 
 
 class SimulationRequest(msgspec.Struct):

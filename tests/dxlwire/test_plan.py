@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import ast
+import contextlib
 import doctest
 import os
 import select
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -137,6 +139,15 @@ def kept(adapters):
 def returned(lines):
     assert select.select([lines], [], [], DEADLINE_S)[0]
     return [one.index for one in lines.returned()]
+
+
+def test_a_socket_carries_the_bytes_of_a_line_once_its_terminal_is_open(adapters):
+    ours, theirs = socket.socketpair()
+    settings = [LineSettings(str(adapters[0].link), 1_000_000, 0, carrier=theirs.detach())]
+    with ours, contextlib.closing(KeptLines(settings)) as lines:
+        os.write(lines.descriptors[0], b"goal")
+        assert ours.recv(100) == b"goal"
+        assert not select.select([adapters[0].master], [], [], 0)[0]
 
 
 def test_a_line_that_is_back_under_another_name_has_its_old_descriptor(adapters, kept):

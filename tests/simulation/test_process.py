@@ -7,6 +7,7 @@ import ctypes
 import os
 import select
 import signal
+import socket
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -241,6 +242,23 @@ def test_an_unplugged_adapter_hangs_up_and_comes_back_under_another_name(tmp_pat
             pings(str(link))
         process.hang_up()
     assert not link.is_symlink()
+
+
+def test_a_socket_carries_the_bytes_of_a_bus_until_its_adapter_is_unplugged(tmp_path):
+    ours, theirs = socket.socketpair()
+    ledger = tmp_path / "bus.jsonl"
+    with ours, theirs, BusProcess(BUSES[:1], ledger, carriers=(theirs.fileno(),)) as process:
+        theirs.close()
+        ours.sendall(PING_1)
+        assert receive(ours.fileno(), 6) == PONG_1
+        assert "fault" in process.ask(fault="unplug bus=main for=50ms")
+        assert select.select([ours], [], [], DEADLINE_S)[0]
+        assert ours.recv(1) == b""
+        while not (path := process.next().get("ports", {}).get("main")):
+            pass
+        pings(path)
+        entries = [entry for entry in process.hang_up() if not entry.note]
+        assert [entry.data for entry in entries] == [PING_1, PONG_1] * 2
 
 
 # Its parts

@@ -101,6 +101,9 @@ class GuardianJob:
     """True if the loop accepts servos that already have torque."""
     epoch_offset_ns: int = 0
     """Wall time minus the run's clock, ns."""
+    carriers: tuple[int, ...] = ()
+    """Descriptors of the sockets that carry the bytes of simulated buses in place of their terminals, in the
+    order of `plan.buses`; -1 for a real bus."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -264,8 +267,10 @@ class Guardian:
         """Open the ports, execute and watch the loop, and make the robot safe after the loop has exited."""
         lines = KeptLines(
             [
-                LineSettings(path, bus.baud_rate, bus.latency_ns, bus.rs485, bus.boot_ns)
-                for path, bus in zip(self._job.ports, self._job.plan.buses, strict=True)
+                LineSettings(path, bus.baud_rate, bus.latency_ns, bus.rs485, bus.boot_ns, carrier)
+                for path, bus, carrier in zip(
+                    self._job.ports, self._job.plan.buses, self._job.carriers, strict=True
+                )
             ],
             describe_holder=describe_run,
         )

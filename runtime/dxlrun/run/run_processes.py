@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import socket
 from collections.abc import Iterable, Mapping
 from dataclasses import astuple
 from pathlib import Path
@@ -122,8 +123,8 @@ def loop_grants(memory: RunMemory) -> tuple[Grant, ...]:
 
 def start_simulated_buses(
     plan: Plan, ledger: Path | None, memory: RunMemory
-) -> tuple[Child[SimulationMessage], dict[str, str]]:
-    """Start the simulated servos; return the process and the pseudo-terminal of each simulated bus.
+) -> tuple[Child[SimulationMessage], dict[str, SimulatedLine]]:
+    """Start the simulated servos; return the process and the host's end of each simulated bus.
 
     With a real-time loop, the process gets a priority above loop and guardian, and the last core that is not
     the loop's: a servo's electronics do not wait for the host's processor.
@@ -134,15 +135,28 @@ def start_simulated_buses(
         if scheduler.policy != "other"
         else (0, -1)
     )
+    config = simulation_of(plan)
+    pairs = [socket.socketpair() for _ in config.buses]
     job = SimulationJob(
-        simulation_of(plan), str(ledger) if ledger else None, *real_time, memory.shafts, memory.simulation
+        config,
+        str(ledger) if ledger else None,
+        *real_time,
+        memory.shafts,
+        memory.simulation,
+        tuple(theirs.fileno() for _, theirs in pairs),
     )
     child = start_simulation(job, memory.stderr)
     try:
-        return child, first_message(child).ports or {}
+        ports = first_message(child).ports or {}
     except BaseException:
         child.kill()
         raise
+    for _, theirs in pairs:
+        theirs.close()
+    return child, {
+        bus.name: SimulatedLine(ports[bus.name], ours.detach())
+        for bus, (ours, _) in zip(config.buses, pairs, strict=True)
+    }
 
 
 def start_source(
@@ -206,7 +220,12 @@ def start_gateway(
 
 
 def guardian_job(
-    plan: Plan, ports: Mapping[str, str], memory: RunMemory, *, take_over: bool, epoch_offset_ns: int = 0
+    plan: Plan,
+    simulated: Mapping[str, SimulatedLine],
+    memory: RunMemory,
+    *,
+    take_over: bool,
+    epoch_offset_ns: int = 0,
 ) -> GuardianJob:
     """Return the job of the guardian, from which it makes the job of the loop."""
     scheduler = plan.loop.scheduler
@@ -220,8 +239,9 @@ def guardian_job(
         lock_memory=scheduler.lock_memory,
         last=plan.loop.policies.on_fault.last,
     )
-    paths = tuple(ports.get(bus.name, bus.port) for bus in plan.buses)
-    return GuardianJob(share, paths, memory, os.getpid(), take_over, epoch_offset_ns)
+    lines = [simulated.get(bus.name, SimulatedLine(bus.port, -1)) for bus in plan.buses]
+    paths, carriers = tuple(one.terminal for one in lines), tuple(one.carrier for one in lines)
+    return GuardianJob(share, paths, memory, os.getpid(), take_over, epoch_offset_ns, carriers)
 
 
 def start_guardian(job: GuardianJob, others: Iterable[int]) -> Child[GuardianMessage]:
@@ -231,9 +251,23 @@ def start_guardian(job: GuardianJob, others: Iterable[int]) -> Child[GuardianMes
     dies, these processes see their channels close only after the guardian has made the robot safe.
     """
     memory = job.memory
-    inherited = [memory.guardian, memory.stderr, *memory.of_loop, *others]
+    carriers = [one for one in job.carriers if one >= 0]
+    inherited = [memory.guardian, memory.stderr, *memory.of_loop, *carriers, *others]
     program = ProcessModule("guardian", "dxlrun.run.guardian")
-    return _executed(program, job, inherited, memory, Decoder(GuardianMessage))
+    try:
+        return _executed(program, job, inherited, memory, Decoder(GuardianMessage))
+    finally:
+        for descriptor in carriers:
+            os.close(descriptor)
+
+
+class SimulatedLine(NamedTuple):
+    """Host's end of a simulated bus."""
+
+    terminal: str
+    """Path of its pseudo-terminal."""
+    carrier: int
+    """Descriptor of the socket that carries its bytes in place of the terminal."""
 
 
 class ProcessModule(NamedTuple):

@@ -44,7 +44,13 @@ def main() -> int:
             progress = None if job.progress < 0 else SimulationProgress(job.progress)
             recordings = read_recordings(job.config.buses)
             server = Server(
-                job.config, ledger, starter, shafts=shafts, progress=progress, recordings=recordings
+                job.config,
+                ledger,
+                starter,
+                shafts=shafts,
+                progress=progress,
+                recordings=recordings,
+                carriers=job.carriers,
             )
         except (DxlrunError, OSError, LookupError, ValueError) as error:
             starter.send_message(SimulationMessage(error=str(error)))

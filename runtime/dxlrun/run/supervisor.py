@@ -59,6 +59,7 @@ from dxlrun.run.run_log import discard_log, incomplete_log, log_header, new_log
 from dxlrun.run.run_processes import (
     GatewayMessage,
     RecorderMessage,
+    SimulatedLine,
     SourceMessage,
     create_memory,
     guardian_job,
@@ -203,9 +204,9 @@ class _Run:
         """Start all processes in sequence, and return the guardian; raises PortError or ProcessFault."""
         if self.options.record:
             self.log = new_log(self.plan.recording, self.plan.robot)
-        ports: dict[str, str] = {}
+        simulated: dict[str, SimulatedLine] = {}
         if self.plan.simulated:
-            self.simulation, ports = start_simulated_buses(self.plan, self.options.ledger, self.memory)
+            self.simulation, simulated = start_simulated_buses(self.plan, self.options.ledger, self.memory)
         for planned in planned_processes(self.plan.loop):
             child = start_source(self.plan, planned, self.memory)
             self.sources.append(_SourceProcess(self.plan, planned, self.memory, child))
@@ -220,7 +221,11 @@ class _Run:
         self.post_pause()
         others = [child.channel.fileno() for child in (self.simulation, self.recorder) if child]
         self.job = guardian_job(
-            self.plan, ports, self.memory, take_over=self.options.take_over, epoch_offset_ns=self.offset_ns
+            self.plan,
+            simulated,
+            self.memory,
+            take_over=self.options.take_over,
+            epoch_offset_ns=self.offset_ns,
         )
         Heartbeat(self.memory.heartbeat).set_steering(self.steering)
         self.guardian = start_guardian(self.job, others)

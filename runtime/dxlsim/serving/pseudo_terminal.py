@@ -35,18 +35,35 @@ class PseudoTerminal:
     delivered yet. pypot 5.0 does so before each packet."""
 
     def __init__(
-        self, bus: SimulatedBus, link: DeviceLink | None = None, progress: memoryview | None = None
+        self,
+        bus: SimulatedBus,
+        link: DeviceLink | None = None,
+        progress: memoryview | None = None,
+        carrier: int | None = None,
     ) -> None:
+        """Create the terminal.
+
+        Args:
+            bus: The bus.
+            link: Link to the device; None: none.
+            progress: Words in which the line's progress is published; None: nobody watches.
+            carrier: Descriptor of a socket that carries the bytes until the adapter is unplugged; None: the
+                terminal does. The Linux kernel moves the bytes of a terminal in a worker thread of ordinary
+                priority (flush_to_ldisc), which waits for other programs: on busy cores for milliseconds.
+        """
         self.bus = bus
         self._link = link
         self._progress = None if progress is None else (ctypes.c_char * progress.nbytes).from_buffer(progress)
-        """Words in which the line's progress is published; None: nobody watches."""
+        self._carrier = carrier
+        if carrier is not None:
+            os.set_blocking(carrier, False)
         self._master, self._name = self._new_pair()
         self.state = TerminalState(
             bus=bus.address,
             progress=None if self._progress is None else ctypes.addressof(self._progress),
             served_ns=-1,
-            descriptor=self._master,
+            descriptor=self._master if carrier is None else carrier,
+            has_settings=carrier is None,
             opened=bus.times_unplugged,
             plugged=1,
         )
@@ -67,7 +84,7 @@ class PseudoTerminal:
 
     def fileno(self) -> int:
         """Return the descriptor that becomes readable when the host has written."""
-        return self._master
+        return int(self.state.descriptor)
 
     def follow_adapter(self) -> bool:
         """Unplug or plug in the terminal like the adapter of the bus; return True if the device has changed.
@@ -83,7 +100,8 @@ class PseudoTerminal:
             # Opened before the old one is closed, to get another name
             self._master, self._name = self._new_pair()
             os.close(old)
-            self.state.descriptor = self._master
+            self._close_carrier()
+            self.state.descriptor, self.state.has_settings = self._master, 1
             self._unpublish()
         self.state.plugged = self.bus.plugged
         if self.plugged:
@@ -116,7 +134,13 @@ class PseudoTerminal:
     def close(self) -> None:
         """Close the terminal and remove its link."""
         os.close(self._master)
+        self._close_carrier()
         self._unpublish()
+
+    def _close_carrier(self) -> None:
+        if self._carrier is not None:
+            os.close(self._carrier)
+            self._carrier = None
 
     def _new_pair(self) -> tuple[int, str]:
         """Return the descriptor of a new terminal's master and the path of its slave, which is raw and has

@@ -57,6 +57,7 @@ class Server:
         shafts: ShaftSink | None = None,
         progress: ServerProgressReceiver | None = None,
         recordings: Mapping[str, RecordedPackets] = MappingProxyType({}),
+        carriers: Sequence[int] = (),
     ) -> None:
         """Create the buses and their terminals.
 
@@ -68,6 +69,7 @@ class Server:
             progress: Receives the time up to which each line was served, for a host that waits for this
                 process.
             recordings: Packets of each bus that is `recorded`, by the name of the bus.
+            carriers: As in `SimulationJob`.
         """
         self.start_ns = time.monotonic_ns()
         self._ledger = ledger
@@ -85,7 +87,12 @@ class Server:
         self._faults.attach(self._buses, start_ns=self.start_ns)
         links = {name: DeviceLink(Path(path)) for name, path in config.links.items()}
         self._terminals = tuple(
-            PseudoTerminal(bus, links.get(bus.name), None if progress is None else progress.line(index).words)
+            PseudoTerminal(
+                bus,
+                links.get(bus.name),
+                None if progress is None else progress.line(index).words,
+                carriers[index] if carriers else None,
+            )
             for index, bus in enumerate(self._buses)
         )
         self._shafts = None if shafts is None else ShaftPublisher(self._mechanics, shafts)

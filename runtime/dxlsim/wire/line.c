@@ -1661,6 +1661,7 @@ typedef struct { /* simulation's end of a terminal, whose other end hosts open l
     int64_t held_ns;   /* time until which the terminal is not read because its host is too fast; 0: it is read */
     int32_t descriptor, opened; /* `opened`: how often the adapter had been unplugged */
     int32_t plugged, ready, size, known;
+    int32_t has_settings, unused; /* 0: a socket carries the bytes, at the rate of the line */
     uint8_t settings[44]; /* struct termios2 at the host's last write; valid if `known` */
     uint8_t chunk[4096];
 } Terminal;
@@ -1772,7 +1773,8 @@ int32_t line_accept(Terminal *t, int64_t now_ns)
     if (!size)
         return 0;
     memset(&settings, 0, sizeof settings);
-    ioctl(t->descriptor, TCGETS2, &settings);
+    if (t->has_settings)
+        ioctl(t->descriptor, TCGETS2, &settings);
     if (!t->known || memcmp(&settings, t->settings, sizeof settings)) { /* the rate changes only with the settings */
         memcpy(t->settings, &settings, sizeof settings);
         t->known = 1;

@@ -50,6 +50,9 @@ class LineSettings(msgspec.Struct, frozen=True):
     latency_ns: int  # Longest acceptable latency timer of its adapter
     rs485: bool = False
     boot_ns: int = 0  # Boot time of the adapter after it was plugged in and opened
+    carrier: int = -1
+    """Descriptor of a socket that carries the bytes of simulated servos after their terminal was opened; -1:
+    none. The opened lines own it."""
 
 
 class OpenedLine(msgspec.Struct, frozen=True):
@@ -152,7 +155,10 @@ class KeptLines:
         )
         done, wrong = shorten(port.fileno(), path, line.latency_ns, self._system)
         remark = rate_remark(port, line.baud_rate)
-        return OpenedLine(index, port.detach(), done, wrong, remark)
+        descriptor = port.detach()
+        if line.carrier >= 0:
+            put_in_place(line.carrier, descriptor)
+        return OpenedLine(index, descriptor, done, wrong, remark)
 
     def _keep_trying(self, index: int) -> None:
         pause_s = FIRST_PAUSE_S
