@@ -1,12 +1,8 @@
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-
-from dxlsim.bus.ledger import LedgerEntry, read_ledger
-from dxlsim.simulation_plan import BusConfig
-from exchange.simulated import SimulatedServos
+from tests.kit.bus_process import SimulatedLine, simulated_lines
 
 ROBOTS = Path(__file__).parents[2] / "robots"
 
@@ -30,22 +26,8 @@ def reader(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-SimulatedLine = Callable[[BusConfig], tuple[str, Callable[[], tuple[LedgerEntry, ...]]]]
-
-
 @pytest.fixture
 def simulated_line(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SimulatedLine]:
     """Serve a simulated bus; gives its pseudo-terminal, and what ends it and has the ledger."""
-    ledger = tmp_path_factory.mktemp("line") / "ledger.jsonl"
-    with ExitStack() as stack:
-
-        def start(bus: BusConfig) -> tuple[str, Callable[[], tuple[LedgerEntry, ...]]]:
-            served = stack.enter_context(SimulatedServos((bus,), -1, ledger))
-
-            def finish() -> tuple[LedgerEntry, ...]:
-                stack.close()
-                return tuple(read_ledger(ledger))
-
-            return served.ports[0], finish
-
-        yield start
+    with simulated_lines(tmp_path_factory.mktemp("line")) as serve:
+        yield serve

@@ -19,6 +19,7 @@ from msgspec.structs import replace
 from rich.console import Console
 from tests.kit.answers import result_of
 from tests.kit.commands import Dxlrun, Said
+from tests.kit.judges import log_has_every_byte
 
 from dxlrun.channels.event_records import (
     RUN_ENDED,
@@ -38,6 +39,7 @@ from dxlrun.plan.machine_load import MachineLoad, SimulationWait
 from dxlrun.run.run_summary import RunOptions, RunStatusLine, RunSummary, run_verdict
 from dxlrun.run.virtual_run import VirtualRobot, run_virtual
 from dxlrun.testing import plan_of
+from dxlsim.bus.ledger import read_ledger
 
 Meanwhile = Callable[[float, Callable[[VirtualRobot], object]], None]
 GOOD = RunSummary(0, "ended", 100, 2, 2.03, (), events=EventTotals(goals=GoalTotals()))
@@ -450,3 +452,11 @@ def test_run_on_virtual_time_shows_its_progress(torso: Path, monkeypatch: pytest
     run_virtual(plan_of(torso, duration_s=0.2), RunOptions(record=False), console)
     assert len(line.shown) == 10
     assert re.fullmatch(r"bioloid_torso: 0\.2 of 0\.2 s, .* x, 0 periods skipped \(.*", line.shown[-1])
+
+
+@pytest.mark.parametrize("virtual", [True, False])
+@pytest.mark.usefixtures("reader")
+def test_the_log_of_a_run_is_what_its_buses_saw(dxlrun: Callable, torso: Path, *, virtual: bool):
+    dxlrun(torso, "--duration", "0.3", "--ledger", "seen.jsonl", *(["--virtual"] if virtual else []))
+    (log,) = Path("logs").iterdir()  # no ledger beside the log
+    log_has_every_byte(read_log(log), read_ledger(Path("seen.jsonl")))

@@ -1,13 +1,16 @@
-"""Commands for a running robot when none runs, and how their words are read."""
+"""Words: commands for a running robot when none runs, how they are read, and those of states."""
 
 from __future__ import annotations
 
 import io
+import json
+import re
 from pathlib import Path
 
 import pytest
 from rich.console import Console
 
+from dxlrun.channels.cycle import Torque
 from dxlrun.cli.steering.steer import command, controllers, headline, state
 from dxlrun.cli.steering.written import WrittenEntry
 from dxlrun.errors import InputError, Refused
@@ -62,3 +65,18 @@ def test_no_name_is_broken_on_a_narrow_terminal(width: int) -> None:
     words = file.getvalue().split()
     assert {f"{joint}," for joint in joints[:-1]} | {joints[-1]} <= set(words)
     assert {"arm", "head", "active", "go;", "stop"} <= {word.strip(":,") for word in words}
+
+
+ROOT = Path(__file__).parents[2]
+
+
+def test_joint_without_torque_is_limp_whatever_the_reason() -> None:
+    assert [torque.word for torque in Torque] == [
+        *("unknown", "on", "doubt", "limp", "limp", "lost", "rebooting", "given")
+    ]
+
+
+def test_page_has_the_words_of_the_states() -> None:
+    text = (ROOT / "plugins/dxlrun_view/page/state.js").read_text()
+    (words,) = re.findall(r"const TORQUE = (\[.+?\]);", text)
+    assert json.loads(words) == [torque.word for torque in Torque]

@@ -1,13 +1,23 @@
-"""What becomes of a late cycle: by the robot file, by a plug-in, and by a plug-in that fails at it."""
+"""What becomes of a late cycle, by the robot file and by plug-ins, and the page on real time."""
+
+import re
+from types import ModuleType
+from typing import get_args
 
 import numpy as np
+import pluggy
 import pytest
 from tests.kit.loops import PERIOD_NS
 from tests.kit.packages import plugin_folder
+from tests.kit.pages import page_text
 
 from dxlrun.channels.answers import Code
 from dxlrun.channels.event_records import EventCode, Severity
+from dxlrun.contract.hookspecs import GROUP, HookSpecs
 from dxlrun.control.controllers.plugin_loading import OverrunHook, load_plugins
+from dxlrun.control.schedule import MOST_CAUGHT_UP
+from dxlrun.description.robot import Scheduler
+from dxlrun.plan.loop_plan import OverrunPolicy
 
 CAUGHT_UP, SKIPPED = [0, 1, 2, 3, 4, 5], [0, 1, 4, 5]
 
@@ -108,3 +118,29 @@ def test_an_installed_plug_in_is_gathered_with_the_arguments_it_wants(tmp_path, 
     (hook,) = load_plugins().overrun_hooks
     assert hook.plugin == "patient_overrun (patient 1.0)"
     assert [hook.decide(7, 5_000, late_ns) for late_ns in (6_000, 6_001)] == [None, "stop"]
+
+
+PAGE = page_text("real-time.md")
+
+
+def test_the_hook_of_the_page_is_one():
+    (source,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+    module = ModuleType("page")
+    exec(source, module.__dict__)  # noqa: S102 (it is our own page)
+    manager = pluggy.PluginManager(GROUP)
+    manager.add_hookspecs(HookSpecs)
+    manager.register(module)  # raises for what is no hook
+    manager.check_pending()
+    assert module.dxlrun_overrun(0, 50_000_001) == "stop"
+    assert module.dxlrun_overrun(0, 50_000_000) is None
+
+
+def test_every_policy_for_late_cycles_is_on_the_page():
+    assert set(re.findall(r"^\| `(\w+)` \| [a-z]", PAGE, re.MULTILINE)) >= set(get_args(OverrunPolicy))
+    assert f"up to {MOST_CAUGHT_UP} late cycles follow at once" in PAGE
+
+
+def test_every_request_is_on_the_page():
+    assert Scheduler.model_fields
+    for key in Scheduler.model_fields:
+        assert f"`{key}`" in PAGE, key

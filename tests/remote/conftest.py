@@ -40,7 +40,7 @@ from dxlrun.testing import plan_of
 
 PERIOD_NS = 20_000_000
 TEXTS = Path(__file__).with_name("requests")
-"""Robot files with requests; see `test_request_texts.py`."""
+"""Robot files with requests; see `test_requests.py`."""
 
 
 class Go(dxlrun.CommandModel):

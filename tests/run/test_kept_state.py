@@ -35,6 +35,7 @@ from dxlrun.channels.kept import (
     KeptFile,
     KeptPiece,
     KeptStates,
+    difference,
     file_pieces,
     opened_file,
 )
@@ -453,3 +454,19 @@ def _number(place: Path) -> int:
     state, _ = opened_file(place.read_bytes(), "runs")
     assert state[8:] == bytes([int(state[:8]) % 251]) * 20000
     return int(state[:8])
+
+
+GEARED = {"elbow model": "MX-64", "elbow gear": "2"}
+
+
+@pytest.mark.parametrize(
+    ("then", "now", "told"),
+    [
+        (GEARED, GEARED, ""),
+        (GEARED, GEARED | {"elbow gear": "3"}, "elbow gear was 2, now 3"),
+        (GEARED, {"elbow model": "MX-64"}, "elbow gear was 2, now absent"),
+        ({"elbow model": "MX-64"}, GEARED, "elbow gear was absent, now 2"),
+    ],
+)
+def test_each_fact_that_changed_came_or_went_is_a_difference(then, now, told):
+    assert difference(then, now) == told
