@@ -11,17 +11,107 @@ from __future__ import annotations
 
 import argparse
 import itertools
+import os
+import signal
+import subprocess
+import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from tests.analysis.verdicts.cases import HARDWARE, Case
-from tests.analysis.verdicts.live import Run, compile_jobs, compiling, hog_on_the_core_of_the_loop
 from tests.analysis.verdicts.rig import ROBOTS, Story
+from tests.kit.awaited import DEADLINE_S, until
 
 NAMES = ("mx_two", "ax_single", "x_three")
+
+
+KERNEL = Path(__file__).parents[1] / "runtime/dxlwire/exchange/kernel.c"
+_COMPILE = "while cc -O3 -g -fPIC -Wall -c {kernel} -o {out}; do :; done"
+_HOG = "while True: pass"
+
+Run = subprocess.Popen[str]
+
+
+def descendants(pid: int) -> Iterator[tuple[int, str]]:
+    """Return the processes below one, each with its command line."""
+    parents = {}
+    for place in Path("/proc").glob("[0-9]*"):
+        try:
+            parents[int(place.name)] = int((place / "stat").read_text().rpartition(")")[2].split()[1])
+        except OSError:
+            continue
+    below = [pid]
+    for one in below:
+        below += [child for child, parent in parents.items() if parent == one]
+    for one in below[1:]:
+        try:
+            yield one, (Path(f"/proc/{one}/cmdline").read_bytes().replace(b"\0", b" ").decode())
+        except OSError:
+            continue
+
+
+def process_of(run: Run, what: str) -> int:
+    """Return the process of a run with a word in its command line, once it is there; 0: the run is over."""
+
+    def found() -> list[int]:
+        pids = [pid for pid, words in descendants(run.pid) if what in words]
+        return pids or ([] if run.poll() is None else [0])
+
+    return until(found, what)[0]
+
+
+@contextmanager
+def compiling(count: int) -> Iterator[None]:
+    """Compile the kernel again and again, in several processes."""
+    with ExitStack() as stack:
+        directory = stack.enter_context(tempfile.TemporaryDirectory())
+        for number in range(count):
+            words = ["sh", "-c", _COMPILE.format(kernel=KERNEL, out=f"{directory}/{number}.o")]
+            stack.enter_context(_running(words))
+        yield
+
+
+@contextmanager
+def hogging(core: int) -> Iterator[None]:
+    """Keep one core busy."""
+    with _running([sys.executable, "-c", f"import os; os.sched_setaffinity(0, {{{core}}})\n{_HOG}"]):
+        yield
+
+
+@contextmanager
+def _running(words: list[str]) -> Iterator[None]:
+    with subprocess.Popen(words, start_new_session=True, stderr=subprocess.DEVNULL) as process:
+        try:
+            yield
+        finally:
+            assert process.poll() is None, "it ended by itself"
+            os.killpg(process.pid, signal.SIGKILL)
+
+
+def core_of(pid: int) -> int:
+    """Return on which core a process runs."""
+    return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[36])
+
+
+def compile_jobs(run: Run, count: int) -> str:
+    """Compile beside a run until it is over."""
+    with compiling(count):
+        run.wait(DEADLINE_S)
+    return "compiled"
+
+
+def hog_on_the_core_of_the_loop(run: Run) -> str:
+    """Keep the core busy on which the loop of a run is, as long as it runs."""
+    loop = process_of(run, "loop_process")
+    assert loop, "there is no loop"
+    time.sleep(1.0)
+    with hogging(core_of(loop)):
+        run.wait(DEADLINE_S)
+    return "hogged"
 
 
 def idle(run: Run) -> str:
@@ -49,6 +139,23 @@ LOADS: dict[str, Callable[[Run], str]] = {
 }
 
 
+def run_live(story: Story, load: Callable[[Run], str]) -> Path:
+    """Run a robot in real time by the command line, with something beside it; return its log."""
+    file, played = story.write_files()
+    command = [str(Path(sys.executable).with_name("dxlrun")), str(file), "--no-gateway"]
+    command += ["--duration", f"{story.duration_s:g}"]
+    command += [word for motion in played for word in ("--play", str(motion))]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
+        try:
+            load(process)
+            said, _ = process.communicate(timeout=DEADLINE_S)
+        finally:
+            process.kill()
+    logs = list(story.directory.glob("*.mcap"))
+    assert logs, said
+    return logs[0]
+
+
 def main() -> int:
     """Run them; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -64,8 +171,7 @@ def main() -> int:
             story = Story(ROBOTS[name], f"fault free {number}", Path(directory))
             story.duration_s = options.seconds + 2
             story.motion = story.swing()
-            story.disturb = LOADS[load]
-            found = Case(load, (name,), spared=HARDWARE).compare(ROBOTS[name], story.run())
+            found = Case(load, (name,), spared=HARDWARE).compare(ROBOTS[name], run_live(story, LOADS[load]))
         counts[load, "runs"] += 1
         counts[load, "good"] += found.verdict.good
         counts[load, "accused"] += bool(found.accused)

@@ -15,8 +15,6 @@ without any it is a good one), and what is expected of the verdict on it:
     => says CODE SUBJECT: TEXT        its sentence has the text; `fix`: its remedy; `no fix`: it has not
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable

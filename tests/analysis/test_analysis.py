@@ -1,10 +1,6 @@
 """Analysis: runs that are known to the last number, and what is said of them on terminals of any width."""
 
-from __future__ import annotations
-
 import io
-from collections.abc import Callable
-from pathlib import Path
 from statistics import median
 
 import pytest
@@ -21,7 +17,6 @@ from dxlrun_analysis.parts.part import Report
 from dxlrun_analysis.report import analyze_log, parts, tables
 from dxlwire.packets import PacketKind
 
-Write = Callable[..., Path]
 ASK_5 = bytes.fromhex("ffff0504022406ca")
 ASK_21 = bytes.fromhex("ffff1504022406ba")
 ANSWER = bytes.fromhex("ffff05080000020000000000f0")
@@ -44,7 +39,7 @@ def asked_and_answered(at: int, error: int = 0) -> list[Wire]:
     ]
 
 
-def test_good_run_is_good(write: Write) -> None:
+def test_good_run_is_good(write):
     packets = asked_and_answered(0) + asked_and_answered(20_000)
     cycles = [Cycle(number, late=83 if number == 7 else 60) for number in range(50)]
     verdict = analyze_log(write(cycles, packets)).verdict
@@ -56,7 +51,7 @@ def test_good_run_is_good(write: Write) -> None:
     )
 
 
-def test_run_without_a_cycle_is_reported(write: Write) -> None:
+def test_run_without_a_cycle_is_reported(write):
     report = analyze_log(write())
     assert not report.verdict.good
     assert report.verdict.sentences == (
@@ -70,7 +65,7 @@ def test_run_without_a_cycle_is_reported(write: Write) -> None:
 # Cycles
 
 
-def test_wake_up_latency_is_that_of_the_records(write: Write) -> None:
+def test_wake_up_latency_is_that_of_the_records(write):
     late = [4, 4, 4, 62, 151, 1001, 20_001, 3]
     latency = analyze_log(write([Cycle(number, late=us) for number, us in enumerate(late)])).totals.latency
     assert latency is not None
@@ -83,7 +78,7 @@ def test_wake_up_latency_is_that_of_the_records(write: Write) -> None:
     assert (latency.median_us, latency.p99_us, latency.p999_us) == (33, 20_001, 20_001)
 
 
-def test_percentiles_of_wake_ups_are_values_that_occurred(write: Write) -> None:
+def test_percentiles_of_wake_ups_are_values_that_occurred(write):
     late = [(number * 7919) % 2003 for number in range(2000)]
     report = analyze_log(write([Cycle(number, late=us) for number, us in enumerate(late)]))
     expected = [sorted(late)[rank - 1] for rank in (1980, 1998)]
@@ -94,7 +89,7 @@ def test_percentiles_of_wake_ups_are_values_that_occurred(write: Write) -> None:
     assert [rows[name] for name in ("  99 %", "  99.9 %")] == [microseconds(us) for us in expected]
 
 
-def test_steps_take_the_times_of_the_records(write: Write) -> None:
+def test_steps_take_the_times_of_the_records(write):
     cycles = [Cycle(n, late=50, read=5000 + n, update=100, write=300 - n) for n in range(101)]
     report = analyze_log(write(cycles))
     steps = {step.name: (step.median_us, step.p99_us, step.max_us) for step in STEPS.numbers_of(report)}
@@ -107,7 +102,7 @@ def test_steps_take_the_times_of_the_records(write: Write) -> None:
     assert (idle.name, idle.cycles) == ("idle", 0)
 
 
-def test_periods_that_were_skipped_are_accounted_for(write: Write) -> None:
+def test_periods_that_were_skipped_are_accounted_for(write):
     report = analyze_log(write([Cycle(0), Cycle(1), Cycle(22, skipped=20), Cycle(23)]))
     periods = report.totals.periods
     assert (periods.elapsed, periods.records, periods.skipped) == (24, 4, 20)
@@ -122,7 +117,7 @@ def test_periods_that_were_skipped_are_accounted_for(write: Write) -> None:
     [[(0, 0), (1, 0), (4, 0)], [(0, 0), (3, 1)], [(0, 0), (3, 0), (4, 2)], [(2, 0)]],
     ids=["undeclared", "half declared", "declared late", "no beginning"],
 )
-def test_periods_that_vanished_are_reported(write: Write, numbers: list[tuple[int, int]]) -> None:
+def test_periods_that_vanished_are_reported(write, numbers):
     report = analyze_log(write([Cycle(number, skipped=skipped) for number, skipped in numbers]))
     assert not report.totals.periods.agree
     assert not report.verdict.good
@@ -143,16 +138,14 @@ def test_periods_that_vanished_are_reported(write: Write, numbers: list[tuple[in
     ],
     ids=["a long cycle", "rough wake-ups"],
 )
-def test_long_cycle_and_rough_wake_ups_are_reported(
-    write: Write, monkeypatch: pytest.MonkeyPatch, cycles: list[Cycle], told: str
-) -> None:
+def test_long_cycle_and_rough_wake_ups_are_reported(write, monkeypatch, cycles, told):
     """In whichever slice of the log they are."""
     monkeypatch.setattr(log_writer, "CHUNK_BYTES", 64)
     monkeypatch.setattr(log_reader, "SLICE_BYTES", 1)
     assert told in analyze_log(write(cycles)).verdict.sentences[1]
 
 
-def test_without_known_limits_tracking_compares_with_the_goal_of_the_cycle_before(write: Write) -> None:
+def test_without_known_limits_tracking_compares_with_the_goal_of_the_cycle_before(write):
     cycles = [
         Cycle(0, position=0.0, goal=0.5),
         Cycle(1, position=0.4, goal=0.7, clamped=2),
@@ -169,7 +162,7 @@ def test_without_known_limits_tracking_compares_with_the_goal_of_the_cycle_befor
 # Servos and events
 
 
-def test_servo_that_was_silent_is_named(write: Write) -> None:
+def test_servo_that_was_silent_is_named(write):
     packets = asked_and_answered(0)
     packets += [
         Wire(PacketKind.INSTRUCTION, 21, 1000, ASK_21),
@@ -190,7 +183,7 @@ def test_servo_that_was_silent_is_named(write: Write) -> None:
     assert report.verdict.sentences[2] == f"{missing}; 1 of 2 servos answered every time."
 
 
-def test_error_bits_are_named(write: Write) -> None:
+def test_error_bits_are_named(write):
     packets = asked_and_answered(0) + asked_and_answered(20_000, error=0x24)
     report = analyze_log(write([Cycle(number, late=60) for number in range(50)], packets))
     assert report.totals.servos[0].error_names == ("overheating", "overload")
@@ -204,7 +197,7 @@ def test_error_bits_are_named(write: Write) -> None:
         assert words in "\n".join(others)
 
 
-def test_errors_gaps_and_a_log_without_end_are_reported(write: Write) -> None:
+def test_errors_gaps_and_a_log_without_end_are_reported(write):
     events = [
         Said(EventCode.LOOP_STARTED, Severity.INFO, "50 Hz"),
         Said(EventCode.CONTROLLER_FAULT, Severity.ERROR, "Traceback\nValueError: no"),
@@ -224,11 +217,11 @@ def test_errors_gaps_and_a_log_without_end_are_reported(write: Write) -> None:
 
 
 @pytest.mark.parametrize(("value", "text"), [(83.4, "83 us"), (16_949.0, "16.95 ms"), (2.5e6, "2.50 s")])
-def test_times_are_written_in_fitting_units(value: float, text: str) -> None:
+def test_times_are_written_in_fitting_units(value, text):
     assert microseconds(value) == text
 
 
-def test_no_line_is_longer_than_the_terminal_or_than_reads_well(write: Write) -> None:
+def test_no_line_is_longer_than_the_terminal_or_than_reads_well(write):
     text = "torque is on: " + ", ".join(f"joint_number_{number}" for number in range(30))
     events = [
         Said(EventCode.TORQUE_ON, Severity.INFO, text),

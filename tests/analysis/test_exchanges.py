@@ -1,7 +1,5 @@
 """Exchanges on the buses: which reply answers which request, whose loss a missing one is, who is accused."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -60,7 +58,7 @@ def losses(found: Exchanges) -> dict[int, Loss]:
     }
 
 
-def test_of_a_chain_the_first_silent_servo_has_the_loss() -> None:
+def test_of_a_chain_the_first_silent_servo_has_the_loss():
     found = paired([(ASK, 254, SYNC_READ, 0), (STATUS, 3, status(3), 1)])
     assert losses(found) == {3: Loss.NONE, 7: Loss.OWN, 4: Loss.BEHIND}
     assert found.due.place.tolist() == [0, 1, 2]
@@ -68,12 +66,12 @@ def test_of_a_chain_the_first_silent_servo_has_the_loss() -> None:
     assert found.last_ns.tolist() == [0, 1 * MS]
 
 
-def test_of_a_chain_of_which_nothing_came_it_is_the_line() -> None:
+def test_of_a_chain_of_which_nothing_came_it_is_the_line():
     assert set(losses(paired([(ASK, 254, SYNC_READ, 0)])).values()) == {Loss.LINE}
     assert losses(paired([(ASK, 7, PING_7, 0)])) == {7: Loss.OWN}
 
 
-def test_the_first_reply_of_a_servo_answers_and_one_that_was_not_asked_does_not() -> None:
+def test_the_first_reply_of_a_servo_answers_and_one_that_was_not_asked_does_not():
     found = paired(
         [(ASK, 7, PING_7, 0), (STATUS, 9, status(9), 1), (STATUS, 7, status(7), 2), (STATUS, 7, status(7), 3)]
     )
@@ -83,7 +81,7 @@ def test_the_first_reply_of_a_servo_answers_and_one_that_was_not_asked_does_not(
 
 
 @pytest.mark.parametrize(("kind", "loss"), [(LATE, Loss.LATE), (STATUS, Loss.OWN)])
-def test_a_reply_that_came_late_is_neither_missing_nor_broken(kind: PacketKind, loss: Loss) -> None:
+def test_a_reply_that_came_late_is_neither_missing_nor_broken(kind, loss):
     wires = [(ASK, 7, PING_7, 0), (NOISE, 254, bytes(3), 1), (ASK, 254, PING_ALL, 2), (kind, 7, status(7), 3)]
     found = paired(wires)
     assert losses(found) == {7: loss}
@@ -92,9 +90,7 @@ def test_a_reply_that_came_late_is_neither_missing_nor_broken(kind: PacketKind, 
 
 
 @pytest.mark.parametrize(("after_ms", "loss"), [(50, Loss.LATE), (150, Loss.OWN)])
-def test_the_block_of_a_fast_status_that_comes_by_itself_is_late_and_breaks_no_other(
-    after_ms: int, loss: Loss
-) -> None:
+def test_the_block_of_a_fast_status_that_comes_by_itself_is_late_and_breaks_no_other(after_ms, loss):
     wires = [
         (ASK, 254, FAST_READ, 0),
         (STATUS, 254, CUT, 1),
@@ -106,14 +102,14 @@ def test_the_block_of_a_fast_status_that_comes_by_itself_is_late_and_breaks_no_o
     assert found.due.broken.tolist() == [False, False, False, loss is Loss.OWN]  # of the ping
 
 
-def test_packets_that_are_looked_at_alone_wait_for_no_others() -> None:
+def test_packets_that_are_looked_at_alone_wait_for_no_others():
     pairing, wires = Pairing((BUS,)), [(ASK, 254, SYNC_READ, 0)]
     pairing.alone(columns([(ASK, 254, SYNC_READ, 1000)]))
     assert pairing.alone(columns(wires)).sent_ns.tolist() == paired(wires).sent_ns.tolist()
 
 
 @pytest.mark.parametrize(("read", "shared"), [(SYNC_READ, False), (FAST_READ, True)])
-def test_only_of_a_shared_packet_the_end_may_be_cut(read: bytes, shared: bool) -> None:
+def test_only_of_a_shared_packet_the_end_may_be_cut(read, shared):
     both = bytes((0, 7, 1, 2, 3, 4, 5, 6))
     came = [(STATUS, 254, CUT + both)] if shared else [(STATUS, 3, status(3)), (STATUS, 7, status(7))]
     broken = BrokenReplies(1)
@@ -144,7 +140,7 @@ SYNC_WRITE = bytes.fromhex("fffffd00fe0b00834000010007010401 0000")
     ],
     ids=["behind", "nothing asked", "twice", "acknowledged", "all asked", "owed", "late", "before all"],
 )
-def test_a_reply_that_nothing_asked_for(wires: Wires, unasked: list[int]) -> None:
+def test_a_reply_that_nothing_asked_for(wires, unasked):
     assert paired(wires).unasked.tolist() == unasked
 
 
@@ -156,9 +152,7 @@ def test_a_reply_that_nothing_asked_for(wires: Wires, unasked: list[int]) -> Non
         (12, (4, 9), "12 unrequested replies (of IDs 4, 9)."),
     ],
 )
-def test_a_host_that_uses_the_same_adapter_is_told_by_the_replies_to_it(
-    count: int, ids: tuple[int, ...], told: str
-) -> None:
+def test_a_host_that_uses_the_same_adapter_is_told_by_the_replies_to_it(count, ids, told):
     wires = []
     for number in range(count):
         servo_id = ids[number % len(ids)]
@@ -186,7 +180,7 @@ def swings(losses: int, low: float, high: float, seed: int = 1) -> tuple[Any, An
     return np.histogram(angle, edges)[0], np.histogram(lost, edges)[0]
 
 
-def test_losses_at_one_angle_are_found_with_their_range() -> None:
+def test_losses_at_one_angle_are_found_with_their_range():
     found = narrowest(*swings(12, 20, 30), open_above=False)
     assert found is not None
     assert found[:3] == (104, 105, 12)
@@ -194,17 +188,17 @@ def test_losses_at_one_angle_are_found_with_their_range() -> None:
 
 
 @pytest.mark.parametrize("open_above", [False, True])
-def test_losses_at_any_angle_or_speed_do_not_depend_on_it(open_above: bool) -> None:
+def test_losses_at_any_angle_or_speed_do_not_depend_on_it(open_above):
     named = [narrowest(*swings(5 + seed % 55, -61, 61, seed), open_above=open_above) for seed in range(400)]
     assert len(named) - named.count(None) <= 2  # one in a thousand
 
 
 @pytest.mark.parametrize(("losses", "told"), [(4, False), (5, True)])
-def test_few_losses_prove_nothing_wherever_they_are(losses: int, told: bool) -> None:
+def test_few_losses_prove_nothing_wherever_they_are(losses, told):
     assert (narrowest(*swings(losses, 20, 25), open_above=False) is not None) is told
 
 
-def test_a_joint_that_rests_at_one_angle_proves_nothing() -> None:
+def test_a_joint_that_rests_at_one_angle_proves_nothing():
     time = np.zeros(BINS, np.int64)
     time[80] = 5000
     assert narrowest(time, time // 100, open_above=False) is None
@@ -219,7 +213,7 @@ def own(write: Write, packets: Iterable[tuple[PacketKind, int, bytes]]) -> dict[
 
 
 @pytest.mark.parametrize("behind", [[], [(STATUS, 4, status(4))]], ids=["none", "it comes all the same"])
-def test_servos_behind_a_silent_one_wait_in_vain(behind: list[Any], write: Write) -> None:
+def test_servos_behind_a_silent_one_wait_in_vain(behind, write):
     packets = [(ASK, 254, SYNC_READ), (STATUS, 3, status(3)), *behind]  # 7 is silent, and 4 waits for it
     assert own(write, packets) == {3: (1, 0), 7: (1, 1)}  # nothing is known of 4
 
@@ -227,8 +221,8 @@ def test_servos_behind_a_silent_one_wait_in_vain(behind: list[Any], write: Write
 @pytest.mark.parametrize("rest", [b"", bytes(5)], ids=["silent", "broken"])
 @pytest.mark.parametrize(("blocks", "first_bad"), [([3], 7), ([3, 7], 4)])
 def test_of_a_cut_fast_status_the_intact_blocks_are_replies_and_the_first_bad_one_is_lost(
-    write: Write, blocks: list[int], first_bad: int, rest: bytes
-) -> None:
+    write, blocks, first_bad, rest
+):
     intact = HEAD + b"".join(bytes((0, one, 1, 2, 3, 4, 5, 6)) for one in blocks)
     packets = [(ASK, 254, FAST_READ), (STATUS, 254, intact)] + [(NOISE, 254, rest)] * bool(rest)
     found = own(write, packets)
@@ -245,9 +239,7 @@ LOW = {3: "hip", 7: "knee", 4: "foot"}
     [((12, 0, 0), True), ((9, 0, 0), False), ((12, 2, 0), False), ((12, 0, 20), False)],
     ids=["its own", "few", "another's too", "more bytes than its reply has"],
 )
-def test_of_a_chain_that_is_broken_from_its_first_reply_on_that_servo_is_named(
-    fast: bool, broken: tuple[int, int, int], is_named: bool, write: Write
-) -> None:
+def test_of_a_chain_that_is_broken_from_its_first_reply_on_that_servo_is_named(fast, broken, is_named, write):
     of_first, of_second, more = broken
     head = HEAD if fast else b""
     replies = [bytes((0, servo, 1, 2, 3, 4, 5, 6)) if fast else status(servo) for servo in LOW]
@@ -274,7 +266,7 @@ def test_of_a_chain_that_is_broken_from_its_first_reply_on_that_servo_is_named(
 # Errors, another host, and an echo
 
 
-def test_errors_of_protocol_2_are_numbers_and_the_alert_a_bit(write: Write) -> None:
+def test_errors_of_protocol_2_are_numbers_and_the_alert_a_bit(write):
     packets = [
         Wire(STATUS, 1, 0, status(1, 7)),
         Wire(STATUS, 1, 10, status(1, 0x84)),
@@ -286,7 +278,7 @@ def test_errors_of_protocol_2_are_numbers_and_the_alert_a_bit(write: Write) -> N
 
 
 @pytest.mark.parametrize(("rounds", "lost"), [(1, 0), (2, 1)])
-def test_what_is_open_where_the_log_ends_is_not_lost(write: Write, rounds: int, lost: int) -> None:
+def test_what_is_open_where_the_log_ends_is_not_lost(write, rounds, lost):
     packets = []
     for at in range(0, rounds * 20_000, 20_000):
         packets += [Wire(ASK, 254, at, SYNC_READ), Wire(STATUS, 3, at + 400, status(3))]
@@ -312,9 +304,7 @@ PINGED_2 = status(5)[:-4] + bytes.fromhex("07030001194e")
     ],
     ids=["1", "2", "another's bytes", "a reply's end"],
 )
-def test_what_another_host_left_of_a_reply_is_the_other_hosts(
-    write: Write, protocol: float, spoilt: bytes, ping: str
-) -> None:
+def test_what_another_host_left_of_a_reply_is_the_other_hosts(write, protocol, spoilt, ping):
     read = bytes.fromhex("ffff0504022406ca" if protocol < 2 else "fffffd0005070002840004001d15")
     packets = []
     for at in range(0, 160_000, 20_000):
@@ -326,9 +316,7 @@ def test_what_another_host_left_of_a_reply_is_the_other_hosts(
 
 
 @pytest.mark.parametrize(("heard", "echoes"), [(8, True), (2, False), (16, False)])
-def test_own_instructions_that_come_back_are_an_echo_and_no_other_host(
-    write: Write, heard: int, echoes: bool
-) -> None:
+def test_own_instructions_that_come_back_are_an_echo_and_no_other_host(write, heard, echoes):
     ask, write_all = bytes.fromhex("ffff0504022406ca"), bytes.fromhex("fffffe0783240205fa01aa")
     packets = []
     for number in range(8):
@@ -359,7 +347,7 @@ Judge = Callable[..., dict[str, Finding]]
 
 
 @pytest.fixture
-def found(write: Write) -> Judge:
+def found(write):
     """Judge 400 cycles of a read of all servos and one of a single servo behind it."""
 
     def judged(
@@ -384,28 +372,28 @@ def found(write: Write) -> Judge:
     return judged
 
 
-def test_chains_that_are_silent_while_single_servos_answer_are_the_first_servos(found: Judge) -> None:
+def test_chains_that_are_silent_while_single_servos_answer_are_the_first_servos(found):
     findings = found(silent=lambda cycle: cycle % 8 == 7)
     assert findings["lossy_servo"].subject == "j1"
     assert "and all replies of 50 chains that it starts" in findings["lossy_servo"].sentence
 
 
-def test_where_single_servos_do_not_answer_either_it_is_the_line(found: Judge) -> None:
+def test_where_single_servos_do_not_answer_either_it_is_the_line(found):
     findings = found(silent=lambda cycle: cycle % 8 == 7, lost=lambda cycle, servo: cycle % 15 == 14)
     assert "lossy_servo" not in findings
     assert findings["lossy_line"].subject == "main"
 
 
-def test_a_servo_that_is_late_alone_too_is_the_one_that_makes_its_chain_late(found: Judge) -> None:
+def test_a_servo_that_is_late_alone_too_is_the_one_that_makes_its_chain_late(found):
     findings = found(late_us=lambda cycle, servo: 3000 * (servo in {0, 1} and cycle % 20 in {0, 5}))
     assert findings["slow_servo"].subject == "j1"
 
 
-def test_where_any_servo_is_late_now_and_then_it_is_none_of_them(found: Judge) -> None:
+def test_where_any_servo_is_late_now_and_then_it_is_none_of_them(found):
     assert not {"slow_servo", "late_replies"} & found(late_us=lambda c, servo: 3000 * (c % 27 == 0)).keys()
 
 
-def test_where_single_servos_are_in_time_it_is_not_the_adapter_that_is_late(found: Judge) -> None:
+def test_where_single_servos_are_in_time_it_is_not_the_adapter_that_is_late(found):
     assert "late_replies" not in found(late_us=lambda cycle, servo: 6000 * (servo == 0 and cycle % 3 == 0))
     findings = found(late_us=lambda cycle, servo: 6000 * (cycle % 3 == 0))
     assert findings["late_replies"].subject == "main"

@@ -1,7 +1,5 @@
 """What another host wrote to servos is told, with what failed then; what it only may have written is not."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest
@@ -46,7 +44,7 @@ def write(protocol: float, servo_id: int, name: str, value: int, more: bytes = b
 
 
 @pytest.mark.parametrize("protocol", [1.0, 2.0])
-def test_what_was_written_to_which_servo_and_what_failed_then(protocol: float) -> None:
+def test_what_was_written_to_which_servo_and_what_failed_then(protocol):
     sent = write(protocol, 4, "torque_enable", 0), write(protocol, 4, "baud_rate", 3)
     text, failed = told(protocol, *sent, failure=("knee", EventCode.SERVO_LOST, 1.2))
     assert (text, failed) == ("torque_enable = 0 and baud_rate = 3 to knee (ID 4) before it was lost", True)
@@ -63,9 +61,7 @@ def test_what_was_written_to_which_servo_and_what_failed_then(protocol: float) -
         (EventCode.SERVO_BACK, "knee", 1.1, False),
     ],
 )
-def test_servo_that_failed_before_or_much_later_did_not_by_it(
-    code: EventCode, name: str, at_s: float, by_it: bool
-) -> None:
+def test_servo_that_failed_before_or_much_later_did_not_by_it(code, name, at_s, by_it):
     text, failed = told(1.0, write(1.0, 4, "id", 9), failure=(name, code, at_s))
     assert failed is by_it
     assert text.startswith("id = 9 to knee (ID 4)" if by_it else "id = 9 to ID 4")
@@ -73,7 +69,7 @@ def test_servo_that_failed_before_or_much_later_did_not_by_it(
 
 
 @pytest.mark.parametrize("protocol", [1.0, 2.0])
-def test_all_servos_that_an_instruction_means_are_told(protocol: float) -> None:
+def test_all_servos_that_an_instruction_means_are_told(protocol):
     address, size = item(protocol, "torque_enable")
     several = WIRES[protocol].sync_write(address, size, {3: b"\0", 5: b"\1", 9: b"\0"})
     assert told(protocol, several) == ("torque_enable to IDs 3, 5", False)
@@ -81,7 +77,7 @@ def test_all_servos_that_an_instruction_means_are_told(protocol: float) -> None:
     assert told(protocol, everybody)[0] == "a factory reset to IDs 3, 4, 5"
 
 
-def test_of_a_bulk_write_each_part_is_told() -> None:
+def test_of_a_bulk_write_each_part_is_told():
     part = bytes((4, item(2.0, "torque_enable")[0], 0, 1, 0, 0))
     code = protocol2.Protocol2Instruction.BULK_WRITE
     data = protocol2.instruction_packet(254, code, part + b"\5" + part[1:])
@@ -99,5 +95,5 @@ NOTHING = {
 
 
 @pytest.mark.parametrize("sent", NOTHING)
-def test_what_writes_no_item_of_a_servo_is_not_told(sent: str) -> None:
+def test_what_writes_no_item_of_a_servo_is_not_told(sent):
     assert told(1.0, NOTHING[sent]) == ("", False)

@@ -1,7 +1,5 @@
 """Sources that hang, and sources that only stay as they are."""
 
-from __future__ import annotations
-
 import json
 from types import SimpleNamespace
 from typing import Any
@@ -57,7 +55,7 @@ def still(from_s: float, *cells: int, at: float = 41.0) -> Floats:
     return found
 
 
-def test_sensor_whose_values_stay_while_joints_move_hangs() -> None:
+def test_sensor_whose_values_stay_while_joints_move_hangs():
     (finding,) = findings(HANGS)
     assert (finding.code, finding.subject, finding.rank) == ("frozen", "gyro", Rank.SERVO_CAUSE)
     assert "for 4.0 s while joints moved, starting at 2.0 s" in finding.sentence
@@ -65,16 +63,14 @@ def test_sensor_whose_values_stay_while_joints_move_hangs() -> None:
 
 @pytest.mark.parametrize("joint", [MOVES, RESTS], ids=["joints move", "at rest"])
 @pytest.mark.parametrize(("from_s", "seconds"), [(1.0, 5.0), (4.0, 2.0)])
-def test_device_whose_trembling_values_stand_still_hangs(
-    joint: Floats, from_s: float, seconds: float
-) -> None:
+def test_device_whose_trembling_values_stand_still_hangs(joint, from_s, seconds):
     (finding,) = findings(still(from_s, 0, 1, 2), joint, kind="device")
     assert (finding.code, finding.subject, finding.rank) == ("frozen", "gyro", Rank.SERVO_CAUSE)
     assert "Device gyro (ID 101 on bus main) is frozen: x, y, z stayed identical" in finding.sentence
     assert f"for {seconds:.1f} s, starting at {from_s:.1f} s" in finding.sentence
 
 
-def test_one_value_that_stands_still_beside_others_is_named_alone() -> None:
+def test_one_value_that_stands_still_beside_others_is_named_alone():
     (finding,) = findings(still(3.0, 1), RESTS, kind="device")
     assert (finding.code, finding.rank) == ("frozen", Rank.CAUSE)
     assert "is frozen: y stayed identical for 3.0 s" in finding.sentence
@@ -82,7 +78,7 @@ def test_one_value_that_stands_still_beside_others_is_named_alone() -> None:
 
 
 @pytest.mark.parametrize(("kind", "values"), [("sensor", NOISE[:, None]), ("device", CELLS)])
-def test_source_that_was_lost_meanwhile_did_not_hang(kind: str, values: Floats) -> None:
+def test_source_that_was_lost_meanwhile_did_not_hang(kind, values):
     gone = np.where((EACH > 2.0) & (EACH < 5.0), values[200], values)
     assert findings(gone, kind=kind)
     assert not findings(gone, kind=kind, valid=(TIME <= 2.0) | (TIME >= 5.0))
@@ -117,5 +113,5 @@ REASONS: dict[str, tuple[Any, ...]] = {
 
 
 @pytest.mark.parametrize("case", REASONS)
-def test_source_that_stays_for_a_reason_does_not_hang(case: str) -> None:
+def test_source_that_stays_for_a_reason_does_not_hang(case):
     assert findings(*REASONS[case]) == []

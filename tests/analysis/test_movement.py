@@ -1,24 +1,87 @@
 """Joints that do not do what they are told or follow otherwise than before, and joints that only look so."""
 
-from __future__ import annotations
-
 import math
-from pathlib import Path
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
-from tests.analysis.moved_joints import FAULT, SWING, TICK, TIME, Floats, Joint, behind, findings, since_fault
 from tests.kit.stories import send, tell
 
 from dxlrun.channels.cycle import Torque
 from dxlrun.log.log_reader import read_log
 from dxlrun.plan.loop_plan import JointPlan
-from dxlrun_analysis.finding import Rank
+from dxlrun.testing import simulated_robot
+from dxlrun_analysis.finding import Finding, Rank
 from dxlrun_analysis.joints.following import followed
+from dxlrun_analysis.joints.movement import Movement
 from dxlrun_analysis.joints.planned import PlannedJoint
 from dxlrun_analysis.joints.trail import STEP_S, Trail
-from dxlrun_analysis.report import analyze
+from dxlrun_analysis.report import analyze, analyze_log
+
+Floats = npt.NDArray[np.float64]
+DT = 0.02
+TIME = np.arange(600) * DT  # 12 s
+FAULT = TIME >= 5.0
+SWING = 0.8 * np.sin(3.5 * TIME)
+LOAD = 0.2 + 0.1 * np.sin(7 * TIME)
+TICK = 0.005
+FIELDS = ("position", "velocity", "effort", "goal_effort", "goal_position", "reference")
+
+
+def behind(way: Floats, cycles: int = 2, gain: float = 1.0) -> Floats:
+    """A joint that follows its way some cycles late, and in part."""
+    return gain * np.concatenate([np.full(cycles, way[0]), way[:-cycles]])
+
+
+def since_fault(position: Floats | float, before: Floats | float = behind(SWING)) -> Floats:  # noqa: B008  a constant
+    """Something from 5 s on, and something else before; without one, a joint that follows."""
+    return np.where(FAULT, position, before)
+
+
+@dataclass
+class Joint:
+    """What a joint was to do, and what it did."""
+
+    way: Floats = field(default_factory=lambda: SWING)
+    position: Floats = field(default_factory=lambda: behind(SWING))
+    load: Floats | float = field(default_factory=lambda: LOAD)
+    torque: Any = Torque.ON
+    velocity: float = 1.0  # NaN: not read
+    planned: dict[str, Any] = field(default_factory=dict)
+    effort: Floats | float = math.nan  # what a controller moves it with
+    sought: Floats | float = math.nan  # where that controller is to move it
+
+
+def findings(*joints: Joint, names: Sequence[str] = ()) -> list[Finding]:
+    """Judge joints; all others beside them follow well."""
+    count = len(joints)
+    kind = [("read_ns", np.int64), *((name, np.float64, count) for name in FIELDS)]
+    kind += [("age_ns", np.int64, count), ("torque", np.uint8, count), ("valid", np.bool_, count)]
+    cycles = np.zeros(len(TIME), kind)
+    cycles["read_ns"], cycles["valid"] = 10**9 + (TIME * 1e9).astype(np.int64), True
+    planned = []
+    for row, joint in enumerate(joints):
+        tick = joint.planned.get("tick", TICK)
+        position = np.round(joint.position / tick) * tick
+        velocity = joint.velocity * np.gradient(joint.position, DT)
+        values = (position, velocity, joint.load, joint.effort, joint.way, joint.sought)
+        for name, value in zip(FIELDS, values, strict=True):
+            cycles[name][:, row] = value
+        cycles["torque"][:, row] = joint.torque
+        facts = {"bus": "main", "servos": f"servo {row}", "top_effort": 1.0, "tick": TICK, **joint.planned}
+        planned.append(PlannedJoint(names[row] if names else f"j{row}", **facts))
+    references = [f"pid/{joint.name}/position" for joint in planned]
+    movement = Movement(planned, int(cycles["read_ns"][0]), references)
+    ways = np.array([joint.way for joint in joints]).T
+    for begin in range(0, len(TIME), 150):  # slice by slice, two cycles of the one before with each
+        known = min(begin, 2)
+        part = slice(begin - known, begin + 150)
+        movement.add_cycles(cycles[part], ways[part], known)
+    return list(movement.findings())
+
 
 ZERO = np.zeros(600)
 WELL = Joint(), Joint()
@@ -69,7 +132,7 @@ UNFAITHFUL = {
 
 
 @pytest.mark.parametrize("case", UNFAITHFUL)
-def test_joint_that_does_not_follow_is_named_with_its_numbers(case: str) -> None:
+def test_joint_that_does_not_follow_is_named_with_its_numbers(case):
     joint, words = UNFAITHFUL[case]
     (finding,) = findings(joint, *WELL)
     code = "stood_still" if "stood still" in finding.sentence else "follows_worse"
@@ -77,7 +140,7 @@ def test_joint_that_does_not_follow_is_named_with_its_numbers(case: str) -> None
     assert words in finding.sentence
 
 
-def test_short_and_common_errors() -> None:
+def test_short_and_common_errors():
     short = np.where((TIME >= 5.0) & (TIME < 6.0), STILL, behind(SWING))
     assert told(Joint(position=short, load=JAMMED)) == [("stood_still", "j0", Rank.CAUSE)]
     worse = Joint(position=since_fault(behind(SWING, gain=0.5)))
@@ -101,7 +164,7 @@ def shaking(swing: float, hertz: float) -> Floats:
     ("swing", "hertz", "rank"),
     [(0.04, 10.0, Rank.SERVO), (0.04, 4.0, Rank.REMARK), (0.015, 5.0, Rank.REMARK), (0.005, 5.0, None)],
 )
-def test_joint_that_swings_around_its_goal_oscillates(swing: float, hertz: float, rank: Rank | None) -> None:
+def test_joint_that_swings_around_its_goal_oscillates(swing, hertz, rank):
     shakes = shaking(swing, hertz)
     joint = Joint(position=behind(SWING) + shakes)
     assert told(joint) == [("oscillates", "j0", rank)] * bool(rank)
@@ -113,7 +176,7 @@ def test_joint_that_swings_around_its_goal_oscillates(swing: float, hertz: float
 
 
 @pytest.mark.parametrize(("away", "named"), [(0.15, True), (0.05, False)])
-def test_goals_that_swing_faster_than_the_joint_accuse_its_commands(away: float, named: bool) -> None:
+def test_goals_that_swing_faster_than_the_joint_accuse_its_commands(away, named):
     goals = since_fault(0.15 * np.sign(np.cos(2 * math.pi * 8.0 * TIME + 0.1)), 0.0)
     found = findings(Joint(way=goals, position=(1 - away / 0.15) * goals), *WELL)
     assert [(one.code, one.subject, one.rank) for one in found] == [("oscillates", "j0", Rank.CAUSE)] * named
@@ -122,9 +185,7 @@ def test_goals_that_swing_faster_than_the_joint_accuse_its_commands(away: float,
 
 
 @pytest.mark.parametrize(("hertz", "shakes"), [(5.0, True), (3.0, False)])
-def test_joint_that_a_controller_moves_with_an_effort_shakes_around_its_reference(
-    hertz: float, shakes: bool
-) -> None:
+def test_joint_that_a_controller_moves_with_an_effort_shakes_around_its_reference(hertz, shakes):
     position, nowhere = SWING + shaking(0.06, hertz), ZERO + math.nan
     found = findings(Joint(nowhere, position, effort=SWING, sought=SWING), *WELL)
     assert [(one.code, one.subject) for one in found] == [("oscillates", "j0")] * shakes
@@ -141,7 +202,7 @@ SHIFTED = behind(SWING) + SHIFT
 
 
 @pytest.mark.parametrize("sign", [1, -1])
-def test_position_that_changes_faster_than_the_model_turns_jumped(sign: int) -> None:
+def test_position_that_changes_faster_than_the_model_turns_jumped(sign):
     (finding,) = findings(Joint(position=behind(SWING) + sign * SHIFT, planned=QUICK), *WELL)
     assert (finding.code, finding.rank) == ("position_jumped", Rank.CAUSE)
     assert "a position jump of up to 2" in finding.sentence
@@ -159,7 +220,7 @@ def test_position_that_changes_faster_than_the_model_turns_jumped(sign: int) -> 
     ],
     ids=["unknown", "fast", "by hand", "little", "against"],
 )
-def test_what_a_joint_may_do_is_no_jump(joint: Joint) -> None:
+def test_what_a_joint_may_do_is_no_jump(joint):
     assert "position_jumped" not in {code for code, *_ in told(joint)}
 
 
@@ -172,7 +233,7 @@ controllers: {c: {type: joint_group_velocity_controller, joints: [w]}}
 """
 
 
-def test_wheel_whose_position_wraps_is_not_accused_of_a_slipping_gear(tmp_path: Path) -> None:
+def test_wheel_whose_position_wraps_is_not_accused_of_a_slipping_gear(tmp_path):
     """An AX-12A counts 300 degrees of a turn (e-Manual AX-12A, Present Position (36))."""
     (tmp_path / "robot.yaml").write_text(WHEEL)
     asked = {20: [send("c", "velocities", 3.0)]}
@@ -213,7 +274,7 @@ CAPABLE = {
 
 
 @pytest.mark.parametrize("case", CAPABLE)
-def test_joint_that_does_what_it_can_is_not_accused(case: str) -> None:
+def test_joint_that_does_what_it_can_is_not_accused(case):
     assert told(CAPABLE[case]) == []
 
 
@@ -225,7 +286,7 @@ def test_joint_that_does_what_it_can_is_not_accused(case: str) -> None:
         (since_fault(behind(SWING) + 0.03), []),
     ],
 )
-def test_thresholds_of_a_linear_joint_are_those_of_its_servo(position: Floats, codes: list[str]) -> None:
+def test_thresholds_of_a_linear_joint_are_those_of_its_servo(position, codes):
     linear = {"share": 0.01, "tick": TICK * 0.01}
     joint = Joint(way=SWING * 0.01, position=position * 0.01, planned=linear)
     assert [one.code for one in findings(joint)] == codes
@@ -292,7 +353,7 @@ SAME = {
 
 
 @pytest.mark.parametrize("case", CHANGED)
-def test_joint_that_follows_otherwise_at_the_same_places_is_named_with_its_numbers(case: str) -> None:
+def test_joint_that_follows_otherwise_at_the_same_places_is_named_with_its_numbers(case):
     position, load, words = CHANGED[case]
     (one,) = beside_peers(position, load)
     assert (one.code, one.subject, one.rank) == ("follows_worse", "j0", Rank.CAUSE)
@@ -302,18 +363,18 @@ def test_joint_that_follows_otherwise_at_the_same_places_is_named_with_its_numbe
 
 
 @pytest.mark.parametrize("case", LOADED)
-def test_another_load_at_the_same_places_is_a_remark(case: str) -> None:
+def test_another_load_at_the_same_places_is_a_remark(case):
     (one,) = beside_peers(behind(SWING), LOADED[case])
     assert (one.code, one.subject, one.rank) == ("follows_worse", "j0", Rank.REMARK)
     assert findings(Joint(load=LOADED[case]), Joint(load=LOADED[case]), PEER) == []
 
 
 @pytest.mark.parametrize("case", SAME)
-def test_joint_that_follows_as_its_load_lets_it_is_not_named(case: str) -> None:
+def test_joint_that_follows_as_its_load_lets_it_is_not_named(case):
     assert beside_peers(*SAME[case]) == []
 
 
-def test_what_several_joints_show_accuses_none_of_few_and_no_mirror_images() -> None:
+def test_what_several_joints_show_accuses_none_of_few_and_no_mirror_images():
     loose, looser = (Joint(position=slack(half), load=FRICTION) for half in (0.05, 0.07))
     assert findings(loose, loose, PEER) == []
     assert [one.subject for one in findings(loose, looser, PEER, PEER, PEER)] == ["j0", "j1"]
@@ -323,7 +384,7 @@ def test_what_several_joints_show_accuses_none_of_few_and_no_mirror_images() -> 
     assert findings(loose, looser, PEER, PEER, PEER, names=names) == []
 
 
-def test_joint_that_had_no_torque_is_judged_once_it_is_on_its_way_again() -> None:
+def test_joint_that_had_no_torque_is_judged_once_it_is_on_its_way_again():
     way = 0.3 * np.sin(3.5 * TIME)
     position = np.where(TIME < 5.0, way, way + 0.3 * np.exp(-np.maximum(TIME - 7.0, 0.0) / 1.5))
     torque = np.where((TIME > 5.0) & (TIME < 7.0), 0, Torque.ON)
@@ -334,7 +395,7 @@ def test_joint_that_had_no_torque_is_judged_once_it_is_on_its_way_again() -> Non
 # What is kept of a run
 
 
-def test_long_run_keeps_its_begin_and_its_end() -> None:
+def test_long_run_keeps_its_begin_and_its_end():
     trail, cycles = Trail(1, 0), 30_000
     at_ns = (np.arange(cycles) * 0.03e9).astype(np.int64)
     column = np.arange(cycles, dtype=np.float64)[:, None]
@@ -348,7 +409,7 @@ def test_long_run_keeps_its_begin_and_its_end() -> None:
     assert kept.way[4097:, 0].tolist() == list(range(cycles - 4095, cycles))
 
 
-def test_of_many_cycles_one_is_kept_each_20_ms() -> None:
+def test_of_many_cycles_one_is_kept_each_20_ms():
     trail, values = Trail(1, 10**9), np.zeros((1000, 1))
     at_ns = 10**9 + np.arange(1000) * 1_000_000
     for part in (slice(0, 333), slice(333, 1000)):
@@ -356,7 +417,7 @@ def test_of_many_cycles_one_is_kept_each_20_ms() -> None:
     assert np.diff(trail.samples().at_s) == pytest.approx(STEP_S)
 
 
-def test_joint_is_compared_with_the_lag_of_its_kind() -> None:
+def test_joint_is_compared_with_the_lag_of_its_kind():
     trail, way = Trail(3, 0), np.tile(SWING[:, None], 3)
     position = np.column_stack([behind(SWING, cycles) for cycles in (2, 2, 5)])
     trail.add_cycles((TIME * 1e9).astype(np.int64), way, position, np.zeros_like(way))
@@ -364,3 +425,50 @@ def test_joint_is_compared_with_the_lag_of_its_kind() -> None:
     assert [one.lag_s for one in followed(planned, trail.samples())] == pytest.approx([0.04] * 3)
     other = [*planned[:2], PlannedJoint("j2", tick=TICK, top_effort=1.0, alike="MX")]
     assert [one.lag_s for one in followed(other, trail.samples())] == pytest.approx([0.04, 0.04, 0.1])
+
+
+ROBOT = """name: weak
+buses: {main: {port: sim, protocol: 2.0, baud_rate: 1_000_000, adapter: {kind: direct}}}
+loop: {rate: 50}
+joint_defaults: {bus: main, model: XL-320, reference: 150 deg, direction: 1, limits: {velocity: 3 rad/s}}
+joints:
+  a:
+    id: 1
+    limits: {position: [-120 deg, 120 deg]}
+    simulation: {gravity: 0.12 Nm, inertia: 0.001 kg m^2, gravity_angle: -90 deg}
+    TOLERANCE
+controllers:
+  arm: {type: joint_trajectory_controller, joints: [a], tolerances: {GOAL}}
+"""
+MOTION = """name: up
+motions:
+  - controller: arm
+    points:
+      - {time: 1 s, joints: {a: {position: 0 deg}}}
+      - {time: 2 s, joints: {a: {position: 20 deg}}}
+"""
+
+
+@pytest.mark.parametrize(
+    ("joint", "goal", "good"),
+    [
+        ("", "", False),
+        ("tolerance: 10 deg", "", False),
+        ("tolerance: 40 deg", "", True),
+        ("tolerance: {position: inf, velocity: inf}", "", True),
+        ("", "goal: 40 deg", True),
+    ],
+)
+def test_joint_is_blocked_only_beyond_its_tolerance(tmp_path, joint, goal, good):
+    (tmp_path / "robot.yaml").write_text(ROBOT.replace("TOLERANCE", joint).replace("GOAL", goal))
+    (tmp_path / "up.yaml").write_text(MOTION)
+    log = tmp_path / "run.mcap"
+    simulated_robot(tmp_path / "robot.yaml", play=[tmp_path / "up.yaml"], log=log).run()
+
+    verdict = analyze_log(log).verdict
+
+    assert verdict.good == good, verdict.sentences
+    first = verdict.sentences[0]
+    assert ("1 of 1 goal reached" in first) == good
+    still = {"stood_still", "follows_worse"}
+    assert bool(still & {one.code for one in verdict.findings}) != good, verdict.sentences

@@ -1,10 +1,6 @@
 """Which servos move which joints, by the plan in a log, and what an analysis makes of it."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Callable
-from pathlib import Path
 
 import msgspec
 import pytest
@@ -33,7 +29,7 @@ def plan(
     return {"loop": loop, "buses": [{"name": "main", "servos": servos}], "mechanics": mechanics}
 
 
-def test_a_gear_and_a_slide_share_their_ratio(write: Callable[..., Path]) -> None:
+def test_a_gear_and_a_slide_share_their_ratio(write):
     geared = plan([servo(row, joint, ratio=0.25) for row, joint in enumerate(JOINTS)], unit=LINEAR)
     path = write([Cycle(0), Cycle(1)], plan=geared)
     movers = plan_of(read_log(path)).movers
@@ -46,7 +42,7 @@ def test_a_gear_and_a_slide_share_their_ratio(write: Callable[..., Path]) -> Non
     assert "linear joints in mm" in table.title
 
 
-def test_a_differentials_joints_have_both_servos_and_a_pair_shares_its_joint() -> None:
+def test_a_differentials_joints_have_both_servos_and_a_pair_shares_its_joint():
     both = [servo(0, "wrist/left"), servo(1, "wrist/right", ratio=0.5)]
     coupling = structs.asdict(CouplingPlan("wrist", (0, 1), (0, 1), ((0.5, 0.5), (0.5, -0.5)), ()))
     movers = msgspec.convert(plan(both, couplings=[coupling]), LoggedPlan).movers

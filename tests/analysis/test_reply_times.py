@@ -1,7 +1,5 @@
 """Which servos answer later than the others of their bus, and which only look as if they did."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -110,14 +108,14 @@ def run(
 
 
 @pytest.mark.parametrize("chained", [True, False])
-def test_what_wakes_host_and_adapter_or_is_busy_accuses_no_servo(chained: bool) -> None:
+def test_what_wakes_host_and_adapter_or_is_busy_accuses_no_servo(chained):
     for noise in (0.0, 300.0):
         assert findings(run(chained=chained, wakes=800.0, noise=noise)) == []
     for seed in range(10):
         assert findings(run(chained=chained, noise=2000.0, seed=seed)) == []
 
 
-def test_servo_that_is_late_only_where_it_is_asked_alone_is_not_accused() -> None:
+def test_servo_that_is_late_only_where_it_is_asked_alone_is_not_accused():
     assert findings(run(2, chained=True, idle=900.0)) == []
     assert findings(run(1, 3000.0, idle=-3000.0), line=True) == []  # nor the adapter, of a chain alone
 
@@ -125,14 +123,14 @@ def test_servo_that_is_late_only_where_it_is_asked_alone_is_not_accused() -> Non
 @pytest.mark.parametrize("chained", [True, False])
 @pytest.mark.parametrize("slow", IDS)
 @pytest.mark.parametrize("noise", [0.0, 200.0])
-def test_a_slow_servo_is_named_wherever_it_is(slow: int, chained: bool, noise: float) -> None:
+def test_a_slow_servo_is_named_wherever_it_is(slow, chained, noise):
     (finding,) = findings(run(slow, 900.0, chained=chained, wakes=300.0, noise=noise))
     assert (finding.code, finding.subject) == ("slow_servo", f"j{slow}")
     assert " now and then" not in finding.sentence
 
 
 @pytest.mark.parametrize("slow", IDS)
-def test_servo_that_is_slow_now_and_then_and_another_return_delay_are_named(slow: int) -> None:
+def test_servo_that_is_slow_now_and_then_and_another_return_delay_are_named(slow):
     (finding,) = findings(run(slow, 3000.0, share=0.4, wakes=300.0, noise=20.0))
     assert (finding.code, finding.subject) == ("slow_servo", f"j{slow}")
     assert " sometimes answers late: " in finding.sentence
@@ -143,7 +141,7 @@ def test_servo_that_is_slow_now_and_then_and_another_return_delay_are_named(slow
 
 
 @pytest.mark.parametrize(("took", "named"), [(4000, ["slow_servo"]), (DELAY, [])])
-def test_a_reply_that_was_given_up_is_late_if_it_took_longer_than_others(took: int, named: list[str]) -> None:
+def test_a_reply_that_was_given_up_is_late_if_it_took_longer_than_others(took, named):
     """The line may have lost bytes before it."""
     line = Line()
     for cycle in range(CYCLES):
@@ -156,7 +154,7 @@ def test_a_reply_that_was_given_up_is_late_if_it_took_longer_than_others(took: i
     assert [one.code for one in findings(line)] == named
 
 
-def test_an_adapter_that_is_late_is_named_with_its_timer_and_no_servo() -> None:
+def test_an_adapter_that_is_late_is_named_with_its_timer_and_no_servo():
     assert [(one.code, one.subject) for one in findings(run(wakes=300.0), line=True)] == []
     (finding,) = findings(run(adapter=16_000.0), line=True)
     assert (finding.code, finding.subject) == ("late_replies", "main")

@@ -1,7 +1,5 @@
 """Analysis of steered runs: periods are counted through other rates and pauses, and printed to people."""
 
-from __future__ import annotations
-
 import io
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +13,6 @@ from dxlrun.channels.commands import CommandMessage
 from dxlrun.log.log_reader import Log, read_log
 from dxlrun.output.terminal import show_parts
 from dxlrun_analysis.cycles.punctuality import cycle_periods_ns
-from dxlrun_analysis.parts.part import Report
 from dxlrun_analysis.report import analyze, parts, tables
 
 MS = 1_000_000
@@ -54,16 +51,16 @@ def run(directory: Path, asked: Asked) -> Log:
 
 
 @pytest.fixture(scope="module")
-def log(tmp_path_factory: pytest.TempPathFactory) -> Log:
+def log(tmp_path_factory):
     return run(tmp_path_factory.mktemp("steered"), ASKED)
 
 
 @pytest.fixture(scope="module")
-def report(log: Log) -> Report:
+def report(log):
     return analyze(log)
 
 
-def test_periods_are_those_of_each_cycle(log: Log, report: Report) -> None:
+def test_periods_are_those_of_each_cycle(log, report):
     expected = [20 * MS] * 5 + [10 * MS] * 20 + [20 * MS] * 31
     assert cycle_periods_ns(log).tolist() == expected
     account = report.totals.periods
@@ -73,7 +70,7 @@ def test_periods_are_those_of_each_cycle(log: Log, report: Report) -> None:
     assert account.rates_hz == (50.0, 100.0)
 
 
-def test_verdict_has_it(report: Report) -> None:
+def test_verdict_has_it(report):
     robot, loop, steered, *_ = report.verdict.sentences
     assert robot.startswith("Good: moved by clients within ")
     assert loop == "The loop kept 50 Hz and 100 Hz: 0 of 56 periods skipped, on virtual time."
@@ -83,7 +80,7 @@ def test_verdict_has_it(report: Report) -> None:
     )
 
 
-def test_table_has_each_request_with_its_origin(report: Report) -> None:
+def test_table_has_each_request_with_its_origin(report):
     rows = [[cell.text for cell in row[1:]] for row in tables(report)["steering"].rows]
     assert rows == [
         ["5", "rate 100 Hz", "anna", "done"],
@@ -101,7 +98,7 @@ def test_table_has_each_request_with_its_origin(report: Report) -> None:
     assert report.totals.acts[1].time_s == pytest.approx(0.2)
 
 
-def test_pause_is_counted_in_periods_and_in_seconds(report: Report) -> None:
+def test_pause_is_counted_in_periods_and_in_seconds(report):
     (pause,) = report.totals.pauses
     assert (pause.begin_s, pause.end_s) == pytest.approx((0.2, 0.4))
     assert pause.periods == 15
@@ -113,13 +110,13 @@ def test_pause_is_counted_in_periods_and_in_seconds(report: Report) -> None:
     assert "switch activate tail; deactivate head" in shown
 
 
-def test_refusal_is_that_of_its_command_among_equal_ones_of_a_cycle(tmp_path: Path) -> None:
+def test_refusal_is_that_of_its_command_among_equal_ones_of_a_cycle(tmp_path):
     report = analyze(run(tmp_path, {5: [COMMAND, HAND_OVER, COMMAND]}))
     rows = [[cell.text for cell in row[2:]] for row in tables(report)["steering"].rows]
     assert [row[-1] for row in rows] == ["done", "done", f"refused: {INACTIVE}"]
 
 
-def test_streams_of_two_clients_are_two(tmp_path: Path) -> None:
+def test_streams_of_two_clients_are_two(tmp_path):
     other = structs.replace(STREAMED, origin="bob")
     report = analyze(run(tmp_path, {cycle: [other if cycle % 2 else STREAMED] for cycle in range(5, 9)}))
     assert {row[3].text for row in tables(report)["steering"].rows} == {"anna", "bob"}
@@ -135,7 +132,7 @@ def test_streams_of_two_clients_are_two(tmp_path: Path) -> None:
     ],
     ids=["held", "asked again", "handed over", "to the end"],
 )
-def test_stream_that_ended_by_its_lease_is_told(tmp_path: Path, later: Asked, ends: str) -> None:
+def test_stream_that_ended_by_its_lease_is_told(tmp_path, later, ends):
     stream = {cycle: [STREAMED] for cycle in range(5, 18)}
     report = analyze(run(tmp_path, {**stream, **later}))
     (steered,) = (one for one in report.verdict.findings if one.code == "steered")
@@ -146,7 +143,7 @@ def test_stream_that_ended_by_its_lease_is_told(tmp_path: Path, later: Asked, en
     assert (report.verdict.findings[1] == steered) is ends.endswith("its joints were held")
 
 
-def test_cycle_is_measured_by_its_own_period(tmp_path: Path) -> None:
+def test_cycle_is_measured_by_its_own_period(tmp_path):
     log = run(tmp_path, {5: [rate(200)], 60: [rate(25)]})
     whole = log.cycles["written_ns"] - log.cycles["woken_ns"]
     stretched = log.cycles.copy()
@@ -157,7 +154,7 @@ def test_cycle_is_measured_by_its_own_period(tmp_path: Path) -> None:
     assert sentence.endswith("; a cycle took up to 8000 us, its write 7400 us: own work.")
 
 
-def test_pause_that_the_run_ends_in_lasts_to_the_end(tmp_path: Path) -> None:
+def test_pause_that_the_run_ends_in_lasts_to_the_end(tmp_path):
     (pause,) = analyze(run(tmp_path, {10: [ask("pause")], 20: [ask("stop")]})).totals.pauses
     assert pause.periods == 11
     without = analyze(run(tmp_path, {20: []}))
@@ -165,7 +162,7 @@ def test_pause_that_the_run_ends_in_lasts_to_the_end(tmp_path: Path) -> None:
     assert not any("steered" in sentence for sentence in without.verdict.sentences)
 
 
-def test_page_shows_it(log: Log, report: Report) -> None:
+def test_page_shows_it(log, report):
     from dxlrun_analysis.page.report_page import analyzed_page
 
     _, text = analyzed_page(log)

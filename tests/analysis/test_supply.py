@@ -1,7 +1,5 @@
 """Voltages that fall: of all servos of a bus, of one by itself, and ones that only differ; and heat."""
 
-from __future__ import annotations
-
 import json
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -86,7 +84,7 @@ SUPPLIES: dict[str, tuple[Floats, int | list[int], str, str]] = {
 
 
 @pytest.mark.parametrize("case", SUPPLIES)
-def test_supply_is_told_once_with_its_lowest_voltage_and_when(case: str) -> None:
+def test_supply_is_told_once_with_its_lowest_voltage_and_when(case):
     volts, errors, accused, words = SUPPLIES[case]
     (found,) = findings(volts, errors)
     assert (found.code, found.subject) == ("supply", accused)
@@ -107,7 +105,7 @@ INNOCENT = {
 
 
 @pytest.mark.parametrize("case", INNOCENT)
-def test_voltages_that_differ_accuse_nothing(case: str) -> None:
+def test_voltages_that_differ_accuse_nothing(case):
     assert findings(INNOCENT[case]) == []
 
 
@@ -119,7 +117,7 @@ def test_voltages_that_differ_accuse_nothing(case: str) -> None:
         (75.0, "was hot, at 75 deg C with a limit of 80 deg C"),
     ],
 )
-def test_temperature_near_its_limit_or_beyond_sense_is_told(heat: float, words: str) -> None:
+def test_temperature_near_its_limit_or_beyond_sense_is_told(heat, words):
     (found,) = findings(volts(), heat=heat)
     assert (found.code, found.subject, words in found.sentence) == ("servo_error", "j1", True)
 
@@ -136,9 +134,7 @@ def test_temperature_near_its_limit_or_beyond_sense_is_told(heat: float, words: 
         ),
     ],
 )
-def test_hardware_error_is_what_the_model_means_by_it(
-    model: str, supply: float, expected: dict[int, str]
-) -> None:
+def test_hardware_error_is_what_the_model_means_by_it(model, supply, expected):
     for value, words in expected.items():
         found = findings(volts(None, 12.0 - supply), value, model=model)
         code = "supply" if "voltage" in words else "servo_error"
@@ -146,7 +142,7 @@ def test_hardware_error_is_what_the_model_means_by_it(
         assert all(words in one.sentence for one in found)
 
 
-def test_extremes_are_the_highest_temperature_and_the_lowest_voltage_of_each_joint() -> None:
+def test_extremes_are_the_highest_temperature_and_the_lowest_voltage_of_each_joint():
     never_read = DIP.copy()
     never_read[:, 3] = np.nan
     expected = [("j0", 30.0, 12.0), ("j1", 55.0, 7.0), ("j2", 30.0, 12.0), ("j3", 30.0, None)]

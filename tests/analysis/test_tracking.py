@@ -1,10 +1,7 @@
 """Tracking against the trajectory that a servo could reach, of known joints; whole and in slices."""
 
-from __future__ import annotations
-
 import json
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -31,20 +28,15 @@ DT = 0.02
 TICK = math.radians(300) / 1023
 NAN = math.nan
 Way = npt.NDArray[np.float64]
-Make = Callable[..., Log]
 NECK = JointPlan("neck", -3.0, 3.0, None, top_speed=6.0)
 
 
 @pytest.fixture
-def make(tmp_path: Path) -> Make:
+def make(tmp_path):
     """Return a log of one MX-64 that was sent these goals, and was read at these positions, one a cycle."""
 
     def make(
-        goals: Way,
-        positions: Way,
-        speed: float = NAN,
-        registers: dict[str, int] | None = None,
-        **joint: Any,
+        goals: Way, positions: Way, speed: float = NAN, registers: dict[str, int] | None = None, **joint: Any
     ) -> Log:
         servo = {"joint": "neck", "model": "MX-64", "rad_per_tick": TICK, "rad_s_per_tick": 0.01}
         servo["registers"] = [{"name": name, "value": value} for name, value in (registers or {}).items()]
@@ -105,7 +97,7 @@ WAYS: dict[str, tuple[Way, Way, dict[str, Any], Way]] = {
 
 
 @pytest.mark.parametrize("which", WAYS)
-def test_a_way_is_as_fast_as_the_servo_may_be(make: Make, which: str) -> None:
+def test_a_way_is_as_fast_as_the_servo_may_be(make, which):
     goals, positions, options, expected = WAYS[which]
     log = make(goals, positions, **options)
     assert reachable(log, 0) == pytest.approx(expected, nan_ok=True)
@@ -113,7 +105,7 @@ def test_a_way_is_as_fast_as_the_servo_may_be(make: Make, which: str) -> None:
     assert only(log).worst_rad == pytest.approx(np.nanmax(np.abs(expected - positions)))
 
 
-def test_a_declared_acceleration_counts(make: Make) -> None:
+def test_a_declared_acceleration_counts(make):
     # Goal Acceleration (73) of an MX-64: 8.583 deg/s^2 each
     log = make(stepped(200, 10, 1.0), np.zeros(200), speed=2.0, registers={"goal_acceleration": 20})
     way, ramp_rad_s2 = reachable(log, 0), 20 * math.radians(8.583)
@@ -125,14 +117,14 @@ def test_a_declared_acceleration_counts(make: Make) -> None:
     assert way.max() == 1.0
 
 
-def test_a_stream_that_is_too_fast_is_cut_to_the_speed_that_there_is(make: Make) -> None:
+def test_a_stream_that_is_too_fast_is_cut_to_the_speed_that_there_is(make):
     goals = np.concatenate((np.linspace(0.0, 4.0, 50), np.full(150, 4.0)))  # 4 rad/s
     way = reachable(make(goals, np.zeros(200), velocity=2.0), 0)
     assert np.diff(way).max() == pytest.approx(2.0 * DT)
     assert int(np.argmax(way == 4.0)) == pytest.approx(100, abs=2)
 
 
-def test_a_joint_that_is_given_torque_goes_to_no_goal_from_before(make: Make) -> None:
+def test_a_joint_that_is_given_torque_goes_to_no_goal_from_before(make):
     """A reboot took it back by two turns, and its goal with it."""
     goals = stepped(100, 40, -4 * math.pi)
     log = make(goals, goals, speed=0.5)
@@ -187,14 +179,14 @@ JOINTS: dict[str, tuple[tuple[Way, Way], float, tuple[object, ...]]] = {
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("which", JOINTS)
-def test_joint_is_measured_against_its_way(make: Make, which: str) -> None:
+def test_joint_is_measured_against_its_way(make, which):
     (goals, positions), speed, expected = JOINTS[which]
     joint = only(make(goals, positions, speed=speed))
     for name, value in zip(NUMBERS, expected, strict=True):
         assert value is ANY or getattr(joint, name) == value, name
 
 
-def test_ringing_is_settling_and_sagging_is_error_at_rest(make: Make) -> None:
+def test_ringing_is_settling_and_sagging_is_error_at_rest(make):
     after = np.maximum(np.arange(300) - 110, 0) * DT  # 1 rad at 0.5 rad/s from cycle 10 on
     rings = 0.1 * np.exp(-after / 0.2) * np.sin(20 * after) * (after > 0)
     joint = only(make(stepped(300, 10, 1.0), ramp(300, 10, 1.0, 0.5) + rings - 0.05 * (after > 0), speed=0.5))
@@ -204,7 +196,7 @@ def test_ringing_is_settling_and_sagging_is_error_at_rest(make: Make) -> None:
     assert joint.rest_rad == pytest.approx(0.05, abs=2e-3)
 
 
-def test_states_that_are_not_valid_are_no_error_and_a_joint_that_stands_has_no_lag(make: Make) -> None:
+def test_states_that_are_not_valid_are_no_error_and_a_joint_that_stands_has_no_lag(make):
     positions = np.full(100, 0.001 * np.arange(100) % 2)
     positions[50] = NAN
     log = make(np.zeros(100), positions)
@@ -214,7 +206,7 @@ def test_states_that_are_not_valid_are_no_error_and_a_joint_that_stands_has_no_l
     assert joint.worst_rad == pytest.approx(0.099)
 
 
-def test_terminal_report_and_json_have_the_same_numbers(make: Make) -> None:
+def test_terminal_report_and_json_have_the_same_numbers(make):
     log = make(stepped(200, 10, 1.0), ramp(200, 10, 1.0, 0.5, delay=3), speed=0.5)
     report = analyze(log)
     (row,) = tables(report)["joints"].rows
@@ -231,7 +223,7 @@ def test_terminal_report_and_json_have_the_same_numbers(make: Make) -> None:
 
 
 @pytest.fixture(scope="module")
-def torso(tmp_path_factory: pytest.TempPathFactory) -> Log:
+def torso(tmp_path_factory):
     path = tmp_path_factory.mktemp("torso") / "run.mcap"
     play = [ROBOTS / "motions/three_parts.yaml"]
     simulated_robot(ROBOTS / "bioloid_torso.yaml", play=play, duration_s=9.0, log=path).run()
@@ -256,7 +248,7 @@ def changed(log: Log, seed: int) -> Log:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_slices_give_what_the_whole_log_gives(torso: Log, seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_slices_give_what_the_whole_log_gives(torso, seed, monkeypatch):
     log = changed(torso, seed) if seed else torso
     whole = tracking(log)  # shorter than a block
     assert any(joint.lag_ms is not None for joint in whole)
@@ -272,7 +264,7 @@ def test_slices_give_what_the_whole_log_gives(torso: Log, seed: int, monkeypatch
                 assert getattr(found, name) == close, (size, name)
 
 
-def test_what_rests_for_very_long_is_kept_in_bounded_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_rests_for_very_long_is_kept_in_bounded_memory(monkeypatch):
     monkeypatch.setattr(module, "_LONGEST_REST_S", 0.5)
     found, rested = module._OpenRest(), []
     for start in range(0, 10_000, 50):
@@ -302,14 +294,14 @@ def fitted(goal: Way, position: Way, size: int = 100) -> float | None:
 
 @pytest.mark.parametrize("cycles", [1.0, 3.0, 4.5, 11.0, 20.25])
 @pytest.mark.parametrize("size", [100, 2000])
-def test_the_delay_is_found_to_a_tenth_of_a_cycle(cycles: float, size: int) -> None:
+def test_the_delay_is_found_to_a_tenth_of_a_cycle(cycles, size):
     late = np.sin((NUMBER - cycles) * 0.05)
     noise = 0.05 * np.random.default_rng(1).standard_normal(len(NUMBER))
     assert fitted(SWING, late, size) == pytest.approx(cycles * DT, abs=0.002)
     assert fitted(SWING, late + noise, size) == pytest.approx(cycles * DT, abs=0.003)
 
 
-def test_the_delay_is_refused_where_none_explains_the_difference() -> None:
+def test_the_delay_is_refused_where_none_explains_the_difference():
     assert fitted(SWING, np.sin((NUMBER - 60) * 0.05)) is None  # beyond the longest
     assert fitted(SWING, np.full(2000, 0.3)) is None  # a joint that is blocked
     assert fitted(np.full(2000, 0.5), np.full(2000, 0.5)) is None

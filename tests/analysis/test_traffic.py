@@ -1,7 +1,5 @@
 """Traffic: the ledger of the simulated buses has the same packets and bytes, and slices change no number."""
 
-from __future__ import annotations
-
 import random
 from pathlib import Path
 from types import SimpleNamespace
@@ -79,7 +77,7 @@ def count_slices(found: list[LoggedPacket], size: int) -> object:
 
 
 @pytest.mark.parametrize("window_ms", [100, 10_000])
-def test_slices_of_any_size_have_the_same_traffic(window_ms: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_slices_of_any_size_have_the_same_traffic(window_ms, monkeypatch):
     monkeypatch.setattr(pairing, "DISORDER_NS", window_ms * 1_000_000)
     for seed in range(50):
         chance = random.Random(seed)
@@ -88,7 +86,7 @@ def test_slices_of_any_size_have_the_same_traffic(window_ms: int, monkeypatch: p
 
 
 @pytest.mark.parametrize("name", ["humanoid_20", "mechanics", "wolfgang"])
-def test_traffic_is_that_of_the_ledger(name: str, tmp_path: Path) -> None:
+def test_traffic_is_that_of_the_ledger(name, tmp_path):
     robot = simulated_robot(ROBOTS / f"{name}.yaml", duration_s=1.0, log=tmp_path / "run.mcap")
     FaultScript([parse_fault("storm seed=5 faults=12 within=400ms at=1000ms")]).attach(robot.buses)
     robot.run()

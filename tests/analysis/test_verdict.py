@@ -1,13 +1,9 @@
 """The verdict on logs: what it takes from them, and one verdict everywhere. See totals.txt, too."""
 
-from __future__ import annotations
-
 import json
 import os
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +15,7 @@ from tests.kit.totals import totals_of
 from dxlrun.channels.commands import CommandMessage
 from dxlrun.channels.event_records import EventCode, Severity
 from dxlrun.log import log_reader, log_writer
-from dxlrun.log.log_reader import Log, open_log, read_log
+from dxlrun.log.log_reader import open_log, read_log
 from dxlrun.output.json import json_text
 from dxlrun.run.run_log import log_header
 from dxlrun.testing import plan_of, simulated_robot
@@ -39,7 +35,6 @@ from dxlsim.faults.fault import parse_fault
 from dxlsim.faults.script import FaultScript
 from dxlwire.packets import PacketKind
 
-Make = Callable[..., Any]
 ROBOTS = Path(__file__).parents[2] / "robots"
 PLANNED = {"name": "main", "port": "/dev/ttyUSB3", "baud_rate": 1_000_000, "return_delay_ns": 500_000}
 ASK = bytes.fromhex("ffff0504022406ca")
@@ -49,7 +44,7 @@ ANSWER = bytes.fromhex("ffff05080000020000000000f0")
 # What is taken from a log
 
 
-def test_failure_beside_the_loop_and_invalid_states_are_the_runs(write: Make) -> None:
+def test_failure_beside_the_loop_and_invalid_states_are_the_runs(write):
     cycles = [Cycle(number, valid=number % 2 == 0) for number in range(100)]
     path = write(cycles, metadata={"failures": {"0": "the simulated bus exited before the end of the run"}})
     verdict = analyze_log(path).verdict
@@ -58,7 +53,7 @@ def test_failure_beside_the_loop_and_invalid_states_are_the_runs(write: Make) ->
     assert verdict.sentences[2].startswith("States were invalid: left_elbow_joint in 50.0% of the cycles;")
 
 
-def test_tolerance_is_that_of_the_robot_file_in_the_log(tmp_path: Path, write: Make) -> None:
+def test_tolerance_is_that_of_the_robot_file_in_the_log(tmp_path, write):
     text = (ROBOTS / "bioloid_torso.yaml").read_text().replace("loop:\n", "loop:\n  tolerated_skips: 60 %\n")
     (tmp_path / "robot.yaml").write_text(text.replace("model: {urdf", "# {"))
     simulated_robot(tmp_path / "robot.yaml", duration_s=0.1, log=tmp_path / "simulated.mcap").run()
@@ -69,9 +64,7 @@ def test_tolerance_is_that_of_the_robot_file_in_the_log(tmp_path: Path, write: M
 
 
 @pytest.mark.parametrize(("own", "waiting", "subject"), [(40, 1, "elbow"), (1, 2, "main")])
-def test_invalid_states_are_those_of_the_first_servo_without_a_reply(
-    own: int, waiting: int, subject: str
-) -> None:
+def test_invalid_states_are_those_of_the_first_servo_without_a_reply(own, waiting, subject):
     servos = [LoggedServo(joint, at, row=at) for at, joint in enumerate(("elbow", "wrist"))]
     counts = (0, 1000, 50, 950, 0, (), 900.0, 990.0, 950.0)
     losses = ServoLosses(1000, own, broken_off=50 - own), ServoLosses(1000, 0, broken_off=0)
@@ -87,7 +80,7 @@ def test_invalid_states_are_those_of_the_first_servo_without_a_reply(
     assert f"{waiting} of these joints because a preceding reply was missing" in found.sentence
 
 
-def test_findings_are_sorted_and_decide_whether_a_run_was_good() -> None:
+def test_findings_are_sorted_and_decide_whether_a_run_was_good():
     remark = Finding("oscillates", "elbow", "oscillates.")
     cause = Finding("supply", "wrist", "supply.", "Mend it.", Rank.CAUSE)
     verdict = judge_run(totals(findings=(remark, cause)))
@@ -102,7 +95,7 @@ def test_findings_are_sorted_and_decide_whether_a_run_was_good() -> None:
     assert shown["findings"][1] == told | {"rank": 8, "share": 0.0}
 
 
-def test_line_of_the_robot_is_first_and_accuses_nothing() -> None:
+def test_line_of_the_robot_is_first_and_accuses_nothing():
     hot = Finding("servo_error", "elbow", "It is hot.", rank=Rank.LINE)
     robot, first, *_ = judge_run(totals(findings=(hot,))).findings
     assert (robot.code, robot.subject, robot.rank, first) == ("robot", "", Rank.REMARK, hot)
@@ -117,7 +110,7 @@ def test_line_of_the_robot_is_first_and_accuses_nothing() -> None:
         (b"", False),
     ],
 )
-def test_what_was_granted_is_read_from_the_log(write: Make, data: bytes, granted: bool) -> None:
+def test_what_was_granted_is_read_from_the_log(write, data, granted):
     about = {"scheduler": {"policy": "round_robin"}, "kernel": {"version": "#1 SMP PREEMPT_RT"}}
     path = write(events=[Said(EventCode.SCHEDULER, Severity.INFO, "in words", "loop", data)], metadata=about)
     assert totals_of(path).real_time == RealTime(True, granted, True)
@@ -137,7 +130,7 @@ def test_what_was_granted_is_read_from_the_log(write: Make, data: bytes, granted
         (15_800, 16, ""),
     ],
 )
-def test_replies_are_compared_with_the_plan(write: Make, extra_us: int, latency_ms: int, shown: str) -> None:
+def test_replies_are_compared_with_the_plan(write, extra_us, latency_ms, shown):
     end = 10 * (len(ASK) + len(ANSWER)) + 500 + extra_us
     packets = []
     for at in range(0, 1_250_000, 50_000):
@@ -155,7 +148,7 @@ def test_replies_are_compared_with_the_plan(write: Make, extra_us: int, latency_
     assert "cable" not in late
 
 
-def test_request_that_waits_for_the_line_is_not_late(write: Make) -> None:
+def test_request_that_waits_for_the_line_is_not_late(write):
     goals = bytes.fromhex("ffffff") + bytes(500)  # 5 ms of the line
     packets = []
     for at in range(0, 250_000, 50_000):
@@ -171,9 +164,7 @@ def test_request_that_waits_for_the_line_is_not_late(write: Make) -> None:
 
 
 @pytest.mark.parametrize("virtual", [False, True])
-def test_simulated_bus_is_known_when_the_link_to_its_port_is_gone(
-    write: Make, tmp_path: Path, virtual: bool
-) -> None:
+def test_simulated_bus_is_known_when_the_link_to_its_port_is_gone(write, tmp_path, virtual):
     master, line = os.openpty()
     link = tmp_path / "robot"
     link.symlink_to(os.ttyname(line))
@@ -194,7 +185,7 @@ def test_simulated_bus_is_known_when_the_link_to_its_port_is_gone(
 
 
 @pytest.fixture(scope="module")
-def storm(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def storm(tmp_path_factory):
     """The log of a stormy run, in small chunks, with streams, pauses and refusals."""
     path = tmp_path_factory.mktemp("storm") / "run.mcap"
     robot = simulated_robot(ROBOTS / "bioloid_torso.yaml", duration_s=4.0, log=path)
@@ -214,9 +205,7 @@ def storm(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_log_counted_in_slices_is_the_log_counted_as_a_whole(
-    storm: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_log_counted_in_slices_is_the_log_counted_as_a_whole(storm, monkeypatch):
     for module in (pairing, punctuality, steering_history):
         monkeypatch.setattr(module, "DISORDER_NS", 200 * MS)
     monkeypatch.setattr(log_reader, "SLICE_BYTES", 1)
@@ -232,7 +221,7 @@ def test_log_counted_in_slices_is_the_log_counted_as_a_whole(
     assert whole.events
 
 
-def test_event_is_not_cut_where_a_slice_ends(write: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_event_is_not_cut_where_a_slice_ends(write, monkeypatch):
     monkeypatch.setattr(log_writer, "CHUNK_BYTES", 64)
     text = "Traceback\n" + "x" * 2000 + "\nValueError: the end"
     path = write(
@@ -247,7 +236,7 @@ def test_event_is_not_cut_where_a_slice_ends(write: Make, monkeypatch: pytest.Mo
     ]
 
 
-def test_page_and_json_and_run_have_the_same_verdict(storm: Path, tmp_path: Path) -> None:
+def test_page_and_json_and_run_have_the_same_verdict(storm, tmp_path):
     from dxlrun_analysis.page.report_page import analyzed_page
 
     log, said = read_log(storm), judge_run(totals_of(storm))
@@ -269,13 +258,13 @@ def test_page_and_json_and_run_have_the_same_verdict(storm: Path, tmp_path: Path
 # Falls
 
 
-def test_motion_that_a_controller_begins_is_not_one_of_clients(tmp_path: Path) -> None:
+def test_motion_that_a_controller_begins_is_not_one_of_clients(tmp_path):
     log = tmp_path / "run.mcap"
     simulated_robot(ROBOTS / "fall_reflex.yaml", duration_s=1.0, log=log).run()
     assert "; moved by its controllers within" in judge_run(totals_of(log)).sentences[0]
 
 
-def test_robot_that_its_fall_reflex_could_not_keep_up_fell(tmp_path: Path) -> None:
+def test_robot_that_its_fall_reflex_could_not_keep_up_fell(tmp_path):
     motion, log = ROBOTS / "motions/fall_reflex_tip.yaml", tmp_path / "run.mcap"
     simulated_robot(ROBOTS / "fall_reflex.yaml", play=[motion], log=log).run()
     verdict = judge_run(totals_of(log))
@@ -287,7 +276,7 @@ def test_robot_that_its_fall_reflex_could_not_keep_up_fell(tmp_path: Path) -> No
 
 
 @pytest.fixture(scope="module")
-def short(tmp_path_factory: pytest.TempPathFactory) -> Log:
+def short(tmp_path_factory):
     """The log of a robot without an IMU."""
     path = tmp_path_factory.mktemp("short") / "run.mcap"
     simulated_robot(ROBOTS / "single_joint.yaml", duration_s=0.02, log=path).run()
@@ -302,7 +291,7 @@ def short(tmp_path_factory: pytest.TempPathFactory) -> Log:
         *((90, 0, False), (90, 170, True)),
     ],
 )
-def test_robot_lies_whose_gravity_has_turned(short: Log, kind: str, begin: int, end: int, lies: bool) -> None:
+def test_robot_lies_whose_gravity_has_turned(short, kind, begin, end, lies):
     pitch = np.radians(np.interp(np.arange(200), [0, 60, 120, 200], [begin, begin, end, end]))
     zero, volts = np.zeros(200), np.full(200, 12.0)
     values = [-9.81 * np.sin(pitch), zero, 9.81 * np.cos(pitch)]
@@ -321,7 +310,7 @@ def test_robot_lies_whose_gravity_has_turned(short: Log, kind: str, begin: int, 
     assert found.lies is lies
 
 
-def test_robot_without_an_imu_does_not_fall(short: Log) -> None:
+def test_robot_without_an_imu_does_not_fall(short):
     history = ConductHistory()
     history.add_slice(short)
     assert (history.summarize_conduct().turned_rad, history.summarize_conduct().lies) == (None, False)

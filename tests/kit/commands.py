@@ -75,12 +75,12 @@ class Case(NamedTuple):
     lines: list[tuple[int, str]]
 
 
-def cases(name: str) -> list[Any]:
-    """Return the cases of a text as parameters of a test."""
+def cases(name: str | Path) -> list[Any]:
+    """Return the cases of a text, in tests/cli or at a path, as parameters of a test."""
     return [*_cases(name)]
 
 
-def _cases(name: str) -> Iterator[Any]:
+def _cases(name: str | Path) -> Iterator[Any]:
     text = (TEXTS / name).read_text("utf-8")
     head, rule, _ = text.rpartition("====\n")
     parts = re.split(r"^---- (.+)\n", head, flags=re.MULTILINE)
@@ -94,7 +94,7 @@ def _cases(name: str) -> Iterator[Any]:
         if block and (not line or (each and not line.startswith(" "))):
             command = block[0][1]
             marks = [pytest.mark.needs(extra) for start, extra in NEEDED.items() if command.startswith(start)]
-            yield pytest.param(Case(name, files, block), id=command, marks=marks)
+            yield pytest.param(Case(str(name), files, block), id=command, marks=marks)
             block = []
         if line:
             block.append((number, line))

@@ -1,13 +1,10 @@
 """`dxlrun new-plugin` and `dxlrun plugins`: what is made, what is refused, and what is shown."""
 
-from __future__ import annotations
-
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 from tests.kit.answers import result_of
-from tests.kit.packages import Install, installing
+from tests.kit.packages import installing
 
 from dxlrun.cli import main
 from dxlrun.cli.plugins import _NOT_COPIED
@@ -35,11 +32,10 @@ def dxlrun_controllers():
 def dxlrun_overrun(cycle):
     return None
 """
-Said = Callable[..., tuple[int, str, str]]
 
 
 @pytest.fixture
-def said(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Said:
+def said(capsys, tmp_path, monkeypatch):
     """Return a function that runs a command in an empty directory: its exit code, output and errors."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "200")
@@ -53,12 +49,12 @@ def said(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest
 
 
 @pytest.fixture
-def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install]:
+def install(tmp_path, monkeypatch):
     with installing(tmp_path, monkeypatch) as install:
         yield install
 
 
-def test_the_package_has_names_of_its_own_and_no_licence(said: Said, tmp_path: Path) -> None:
+def test_the_package_has_names_of_its_own_and_no_licence(said, tmp_path):
     code, out, err = said("new-plugin", "arm-waves")
     assert (code, err) == (0, "")
     made = {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file()}
@@ -82,33 +78,7 @@ def test_the_package_has_names_of_its_own_and_no_licence(said: Said, tmp_path: P
     assert len([path for path in (tmp_path / "here/there").rglob("*") if path.is_file()]) == 9
 
 
-@pytest.mark.parametrize(
-    ("name", "sentence"),
-    [
-        ("Arms", "'Arms' is not a valid name of a package; write a letter, then lower-case letters, "),
-        ("7arms", "'7arms' is not a valid name of a package; "),
-        ("my arms", "'my arms' is not a valid name of a package; "),
-        ("../arms", "'../arms' is not a valid name of a package; "),
-        ("arms_", "'arms_' is not a valid name of a package; "),
-        ("a" * 61, f"'{'a' * 61}' is not a valid name of a package; "),
-        ("", "'' is not a valid name of a package; "),
-        ("json", "a Python module json exists already; choose another name, such as my_json\n"),
-        ("numpy", "a Python module numpy exists already; choose another name, such as my_numpy\n"),
-        ("dxlrun", "a Python module dxlrun exists already; choose another name, such as my_dxlrun\n"),
-        ("lambda", "a Python module lambda exists already; choose another name, such as my_lambda\n"),
-    ],
-)
-def test_a_name_that_is_none_is_refused_in_a_sentence(
-    said: Said, tmp_path: Path, name: str, sentence: str
-) -> None:
-    code, out, err = said("new-plugin", name)
-    assert (code, out) == (2, "")
-    assert err.startswith(f"dxlrun: {sentence}")
-    assert err.count("\n") == 1
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_what_is_there_already_stays(said: Said, tmp_path: Path) -> None:
+def test_what_is_there_already_stays(said, tmp_path):
     (tmp_path / "arms").mkdir()
     (tmp_path / "file").write_text("mine")
     (tmp_path / "dangling").symlink_to("nowhere")
@@ -124,7 +94,7 @@ def test_what_is_there_already_stays(said: Said, tmp_path: Path) -> None:
     assert (list((tmp_path / "arms").iterdir()), (tmp_path / "file").read_text()) == ([], "mine")
 
 
-def test_plugins_are_listed_with_what_they_offer(said: Said, install: Install) -> None:
+def test_plugins_are_listed_with_what_they_offer(said, install):
     install("first-one", "first_one", PLUGIN.replace("CONTRACT", "1"))
     install("broken-one", "broken_one", PLUGIN.replace("CONTRACT", "5"))
     code, out, err = said("plugins")
@@ -140,7 +110,7 @@ def test_plugins_are_listed_with_what_they_offer(said: Said, install: Install) -
     ) in out
 
 
-def test_the_list_for_programs(said: Said, install: Install) -> None:
+def test_the_list_for_programs(said, install):
     install("first-one", "first_one", PLUGIN.replace("CONTRACT", "2"))
     install("broken-one", "broken_one", "import no_such_thing")
     code, out, _ = said("plugins", "--json")

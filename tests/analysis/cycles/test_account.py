@@ -1,7 +1,5 @@
 """Waits of a read on its buses: which packet of which bus it was that made the cycle long."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
@@ -89,30 +87,28 @@ def late_by(us: float, bus: int = 0) -> dict[tuple[str, int, int], float]:
         ([8_000, 8_000, 8_001], late_by(8_001 - PLANNED[-1])),
     ],
 )
-def test_the_bus_has_the_time_by_which_the_last_reply_is_late(
-    ends: list[int], expected: dict[tuple[str, int, int], float]
-) -> None:
+def test_the_bus_has_the_time_by_which_the_last_reply_is_late(ends, expected):
     assert split(9_000, [asked(10), *replies(10, ends)]) == expected
 
 
-def test_of_single_reads_each_counts() -> None:
+def test_of_single_reads_each_counts():
     assert split(9_000, [*read_alone(1, 10, 2_000), *read_alone(2, 5_000, 2_000)]) == late_by(4_000)
 
 
-def test_what_the_plan_gives_the_adapter_is_not_late() -> None:
+def test_what_the_plan_gives_the_adapter_is_not_late():
     ends = [end + 4_000 for end in PLANNED]
     slow = structs.replace(BUS, latency_ns=3_000_000)
     assert split(9_000, [asked(10), *replies(10, ends)], slow) == late_by(1_000)
 
 
-def test_of_two_buses_the_one_that_was_waited_for_longest_counts() -> None:
+def test_of_two_buses_the_one_that_was_waited_for_longest_counts():
     late, later = ([end + us for end in PLANNED] for us in (3_000, 5_000))
     packets = [asked(10), asked(10, 1), *replies(10, late), *replies(10, later, 1)]
     assert split(9_000, packets, BUS, structs.replace(BUS, name="other")) == late_by(5_000, bus=1)
 
 
 @pytest.mark.parametrize("answered", [0, 1, 2])
-def test_the_first_servo_without_a_reply_is_waited_for(answered: int) -> None:
+def test_the_first_servo_without_a_reply_is_waited_for(answered):
     packets = [asked(10), *replies(10, PLANNED[:answered])]
     found = split(9_000, packets)
     ((cause, us),) = found.items()
@@ -122,7 +118,7 @@ def test_the_first_servo_without_a_reply_is_waited_for(answered: int) -> None:
     assert us == 9_000 - 10 - heard
 
 
-def test_the_requests_of_another_bus_end_no_exchange() -> None:
+def test_the_requests_of_another_bus_end_no_exchange():
     silent = [asked(10), asked(20, 1), *replies(20, PLANNED, 1)]
     found = split(9_000, silent, BUS, structs.replace(BUS, name="other"))
     assert found == {("missing reply", 0, -1): 9_000 - 10 - len(ASK) * 10}

@@ -1,7 +1,5 @@
 """Causes of late and long cycles: runs of which one cycle took more of something, without a ledger."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -109,7 +107,7 @@ class Run:
 
 
 @pytest.fixture
-def run(write: Make) -> Run:
+def run(write):
     return Run(write)
 
 
@@ -137,13 +135,13 @@ def first(found: Causes) -> tuple[str, str]:
     return found.causes[0].kind, found.causes[0].subject
 
 
-def test_a_run_in_time_has_no_causes(run: Run) -> None:
+def test_a_run_in_time_has_no_causes(run):
     found = causes_of(run.log())
     assert (found.late, found.long, found.excess_ns, found.causes, found.worst) == (0, 0, 0, (), ())
 
 
 @pytest.mark.parametrize(("woken", "counts"), [(150, 0), (151, 1), (7_000, 1)])
-def test_a_late_wake_up_is_one_from_150_us_on(run: Run, woken: int, counts: int) -> None:
+def test_a_late_wake_up_is_one_from_150_us_on(run, woken, counts):
     found = causes_of(run.log(woken=woken))
     assert (found.late, found.long) == (counts, 0)
     assert shares(found) == ({("late wake-up", ""): woken} if counts else {})
@@ -163,7 +161,7 @@ LONG: dict[str, tuple[dict[str, Any], tuple[str, str], float]] = {
 
 @pytest.mark.parametrize("pieces", [1, 4])
 @pytest.mark.parametrize("what", list(LONG))
-def test_a_long_cycle_names_its_cause(run: Run, what: str, pieces: int) -> None:
+def test_a_long_cycle_names_its_cause(run, what, pieces):
     changed, cause, us = LONG[what]
     found = causes_of(run.log(**changed), pieces)
     assert found.long == 1
@@ -178,7 +176,7 @@ def test_a_long_cycle_names_its_cause(run: Run, what: str, pieces: int) -> None:
     assert ("unexplained", "") not in shares(found)
 
 
-def test_a_cycle_that_was_planned_too_long_is_the_plan_s(run: Run) -> None:
+def test_a_cycle_that_was_planned_too_long_is_the_plan_s(run):
     slow = {"buses": [{**PLAN["buses"][0], "return_delay_ns": 15_000_000}]}
     found = causes_of(run.log(late={5: 14_500, 21: 14_500}, plan=slow))
     planned = 2 * (20 * 10 + 15_000)
@@ -194,9 +192,7 @@ def test_a_cycle_that_was_planned_too_long_is_the_plan_s(run: Run) -> None:
         (-20, {("late wake-up", ""): 4_100}),  # in time
     ],
 )
-def test_an_exchange_of_the_idle_time_that_ended_too_late_has_the_lateness(
-    run: Run, replied: int | None, expected: dict[tuple[str, str], float]
-) -> None:
+def test_an_exchange_of_the_idle_time_that_ended_too_late_has_the_lateness(run, replied, expected):
     """`replied`: us behind the deadline."""
     asked = due(BAD) - 900
     idle = [Wire(PacketKind.INSTRUCTION, 21, asked, ASK[21], asked + 10)]
@@ -206,7 +202,7 @@ def test_an_exchange_of_the_idle_time_that_ended_too_late_has_the_lateness(
     assert shares(causes_of(run.log(woken=4_100, idle=idle))) == expected
 
 
-def test_late_replies_are_their_bus_s_however_often_one_servo_has_them(run: Run) -> None:
+def test_late_replies_are_their_bus_s_however_often_one_servo_has_them(run):
     bad = range(0, COUNT, 2)
     found = causes_of(run.log(late={21: 19_500}, bad=bad))
     assert first(found) == ("late reply", "bus main")
@@ -217,11 +213,11 @@ def test_late_replies_are_their_bus_s_however_often_one_servo_has_them(run: Run)
     ("own", "others", "expected"),
     [(9, 0, False), (10, 0, True), (10, 1, True), (10, 2, False), (1000, 100, True), (1000, 101, False)],
 )
-def test_one_is_named_that_has_them_alone(own: int, others: int, expected: bool) -> None:
+def test_one_is_named_that_has_them_alone(own, others, expected):
     assert has_them_alone(own, others) is expected
 
 
-def test_the_worst_cycle_is_a_timeline_with_the_plan_beside_it(run: Run) -> None:
+def test_the_worst_cycle_is_a_timeline_with_the_plan_beside_it(run):
     (worst,) = causes_of(run.log(late={21: 25_000}, woken=40)).worst
     assert (worst.cycle, worst.seconds, worst.woken_us, worst.skipped) == (BAD, BAD * PERIOD / 1e6, 40, 1)
     kinds = [(one.kind, one.servo_id, one.joint) for one in worst.packets]
@@ -238,6 +234,6 @@ def test_the_worst_cycle_is_a_timeline_with_the_plan_beside_it(run: Run) -> None
     assert ends[3] == (begin + 2 * PLANNED + 25_000, begin + 2 * PLANNED)
 
 
-def test_only_the_worst_are_kept_the_worst_first(run: Run) -> None:
+def test_only_the_worst_are_kept_the_worst_first(run):
     found = causes_of(run.log(woken=400, bad=range(20)), 4)
     assert (found.late, len(found.worst)) == (20, 10)

@@ -1,10 +1,6 @@
 """What the machine has of late wake-ups: by the samples beside the cycles."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,7 +15,6 @@ from dxlrun_analysis.causes.machine_history import INTERRUPTS, OTHERS, STEAL
 
 SECOND, NAN = 10**9, float("nan")
 BAD = (60, 70)  # cycles that wake 8 ms late, both in the second second of the run, which begins at 1 s
-Find = Callable[..., Causes]
 
 
 def sample(end_s: float, *, core: int = 0, hot: bool = False, **values: float) -> bytes:
@@ -32,7 +27,7 @@ def sample(end_s: float, *, core: int = 0, hot: bool = False, **values: float) -
 
 
 @pytest.fixture
-def found(write: Callable[..., Path]) -> Find:
+def found(write):
     def causes_of(*samples: bytes) -> Causes:
         log = read_log(write([Cycle(n, late=8_000 if n in BAD else 0) for n in range(160)]))
         topic = LoggedTopic("/machine", schemas.MACHINE, np.zeros(len(samples), np.int64), samples)
@@ -66,9 +61,7 @@ SOME = {("machine", STEAL): 4.0, ("machine", OTHERS): 4.0, ("late wake-up", ""):
         *("another second", "another core", "the busiest of unknown cores"),
     ],
 )
-def test_what_took_the_loop_s_core_has_the_lateness_of_that_second(
-    found: Find, samples: tuple[bytes, ...], expected: dict[tuple[str, str], float]
-) -> None:
+def test_what_took_the_loop_s_core_has_the_lateness_of_that_second(found, samples, expected):
     causes = found(*samples)
     assert causes.excess_ns == sum(one.total_ns for one in causes.causes)
     assert {(one.kind, one.subject): round(one.total_ns / 1e6, 3) for one in causes.causes} == expected
@@ -76,12 +69,12 @@ def test_what_took_the_loop_s_core_has_the_lateness_of_that_second(
     assert kinds == {key: value / 2 for key, value in expected.items()}
 
 
-def test_slow_processor_that_is_hot_is_counted_and_one_that_is_cool_saves_power(found: Find) -> None:
+def test_slow_processor_that_is_hot_is_counted_and_one_that_is_cool_saves_power(found):
     assert found(QUIET, sample(3.0, hot=True), AFTER).throttled == 1
     assert found(sample(2.0), sample(3.0)).throttled == 0
 
 
-def test_load_counts_samples_from_the_first_deadline_on(found: Find) -> None:
+def test_load_counts_samples_from_the_first_deadline_on(found):
     """The first cycle is at 1 s, in the first of these samples; the run ends within the last one."""
     load = found(sample(1.4), sample(2.4, idle=1.0), sample(3.4, idle=1.0), sample(4.4)).load
     assert load.no_idle_core_s == pytest.approx(1.2, abs=0.05)

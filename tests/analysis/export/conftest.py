@@ -1,14 +1,12 @@
 """Made-up logs of two joints, and the fixtures of exports: a run, and the command."""
 
-from __future__ import annotations
-
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 from msgspec import structs
-from tests.kit.commands import Dxlrun, Said
+from tests.kit.commands import Said
 
 from dxlrun.channels.cycle import CycleLayout, CycleRecord
 from dxlrun.channels.ring import RecordKind
@@ -20,7 +18,6 @@ from dxlrun.testing import VirtualRobot, plan_of
 ROBOTS = Path(__file__).parents[3] / "robots"
 PERIOD_NS = 20_000_000
 NAN = float("nan")
-Export = Callable[..., Said]
 Row = tuple[int, Sequence[float], Sequence[float], Sequence[float]]
 """Number of a cycle, positions, goals of position, goals of velocity."""
 ROWS: tuple[Row, ...] = (
@@ -34,7 +31,7 @@ STILL = tuple((number, (0.1, 1.0), (0.1, 0.5), (NAN, NAN)) for number in range(3
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def run(tmp_path_factory):
     """The log of a run of two arms with a motion; beside it a `split` one of the same run, in two parts."""
     path = tmp_path_factory.mktemp("run") / "run.mcap"
     plan = plan_of(ROBOTS / "bioloid_torso.yaml", duration_s=1.6, play=[ROBOTS / "motions/three_parts.yaml"])
@@ -45,7 +42,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def export(dxlrun: Dxlrun) -> Export:
+def export(dxlrun):
     """Run `dxlrun export LOG ... OUT --format TO` in this process; words from the first option on follow."""
 
     def run_export(*words: object) -> Said:

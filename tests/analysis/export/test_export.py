@@ -1,7 +1,5 @@
 """Exports hold what the log holds: CSV and Parquet; what every export refuses."""
 
-from __future__ import annotations
-
 import csv
 import re
 import shlex
@@ -12,10 +10,10 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from msgspec import structs
-from tests.analysis.export.conftest import NAN, ROBOTS, Export, made
+from tests.analysis.export.conftest import NAN, ROBOTS, made
 from tests.kit.answers import result_of
 from tests.kit.changed_logs import write_changed
-from tests.kit.commands import Dxlrun
+from tests.kit.commands import cases, play
 from tests.kit.pages import page_text
 
 from dxlrun.errors import InputError
@@ -37,9 +35,7 @@ def lines(path: Path) -> list[dict[str, str]]:
 # Tables
 
 
-def test_parquet_has_every_record_of_the_log_and_names_topics_without_a_file(
-    run: Path, tmp_path: Path, export: Export
-) -> None:
+def test_parquet_has_every_record_of_the_log_and_names_topics_without_a_file(run, tmp_path, export):
     said = export(run, tmp_path / "out", "parquet", "--json")
     log, result = read_log(run), result_of(said.out)
     tables = {path.stem: pq.read_table(path) for path in (tmp_path / "out").iterdir()}
@@ -91,9 +87,7 @@ def test_parquet_has_every_record_of_the_log_and_names_topics_without_a_file(
     ("robot", "source", "state"),
     [("fall_reflex", "torso_imu", "linear_acceleration.z"), ("wolfgang", "core", "voltage")],
 )
-def test_states_of_sources_and_commands_of_devices_have_columns(
-    tmp_path: Path, export: Export, robot: str, source: str, state: str
-) -> None:
+def test_states_of_sources_and_commands_of_devices_have_columns(tmp_path, export, robot, source, state):
     run = tmp_path / "run.mcap"
     simulated_robot(ROBOTS / f"{robot}.yaml", duration_s=0.1, log=run).run()
     assert export(run, tmp_path / "out", "parquet").code == 0
@@ -112,9 +106,7 @@ def test_states_of_sources_and_commands_of_devices_have_columns(
         assert cycles[f"{device}/command.{name}"].to_pylist() == [None] * len(cycles)
 
 
-def test_csv_has_a_line_a_cycle_or_a_record_and_nothing_where_nothing_is_known(
-    run: Path, tmp_path: Path, export: Export
-) -> None:
+def test_csv_has_a_line_a_cycle_or_a_record_and_nothing_where_nothing_is_known(run, tmp_path, export):
     rows = ((0, (0.5, NAN), (NAN, 0.25), (2.0, NAN)), (3, (0.6, 1.0), (NAN, 0.5), (2.0, NAN)))
     assert export(made(tmp_path / "made.mcap", rows), tmp_path / "out.csv", "csv").code == 0
     first, second = lines(tmp_path / "out.csv")
@@ -134,16 +126,14 @@ def test_csv_has_a_line_a_cycle_or_a_record_and_nothing_where_nothing_is_known(
 
 
 @pytest.mark.parametrize("to", FORMATS)
-def test_a_split_log_is_exported_as_a_whole_one(run: Path, tmp_path: Path, export: Export, to: str) -> None:
+def test_a_split_log_is_exported_as_a_whole_one(run, tmp_path, export, to):
     logs = (run, run.with_name("split"))
     said = [result_of(export(log, tmp_path / log.name, to, "--json").out) for log in logs]
     counts = [one.get("rows") or one["frames"] for one in said]
     assert counts[0] == counts[1] > 40
 
 
-def test_logs_md_its_exports_are_made(
-    run: Path, tmp_path: Path, dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_logs_md_its_exports_are_made(run, tmp_path, dxlrun, monkeypatch):
     monkeypatch.chdir(tmp_path)
     commands = re.findall(r"^    dxlrun (export .+)$", page_text("logs.md"), re.MULTILINE)
     assert len(commands) == 4
@@ -154,7 +144,7 @@ def test_logs_md_its_exports_are_made(
         assert Path(words[words.index("--format") - 1]).exists()
 
 
-def test_time_goes_on_through_the_slices_of_a_log(tmp_path: Path) -> None:
+def test_time_goes_on_through_the_slices_of_a_log(tmp_path):
     log = read_log(made(tmp_path / "a.mcap"))
     slices = [replace(log, cycles=log.cycles[at : at + 1]) for at in range(len(log.cycles))]
     (rows,) = tables_of(slices, ["/cycle"])
@@ -164,42 +154,21 @@ def test_time_goes_on_through_the_slices_of_a_log(tmp_path: Path) -> None:
 # What is refused
 
 
-@pytest.mark.parametrize(
-    ("to", "topic", "sentence"),
-    [
-        ("csv", "/goal", "no records of /goal; did you mean /goals?"),
-        ("csv", "/joint_states", "/joint_states has no table: the states are in /cycle"),
-        ("parquet", "/goals", "--topic is only for csv, parquet has all topics"),
-    ],
-)
-def test_a_wrong_topic_is_one_sentence_and_leaves_nothing(  # noqa: PLR0917  fixtures, and a case
-    run: Path, tmp_path: Path, export: Export, to: str, topic: str, sentence: str
-) -> None:
-    said = export(run, tmp_path / "out", to, "--topic", topic)
-    (error,) = said.errors
-    assert (said.code, list(tmp_path.iterdir())) == (2, [])
-    assert sentence in error
+@pytest.mark.parametrize("case", cases(Path(__file__).with_name("refusals.txt")))
+def test_refused(run, tmp_path, monkeypatch, dxlrun, case):
+    monkeypatch.chdir(tmp_path)
+    Path("run.mcap").symlink_to(run)
+    made(Path("a.mcap"))
+    made(Path("other.mcap"), robot="twin")
+    made(Path("joints.mcap"), joints=("wheel", "leg"))
+    made(Path("still.mcap"), [(n, (0.1, 1.0), (NAN, NAN), (NAN, NAN)) for n in range(3)])
+    made(Path("deaf.mcap"), [(n, (0.1, NAN), (NAN, 0.5), (NAN, NAN)) for n in range(3)])
+    apart = [(n, (0.1, 1.0), (0.1, NAN if n < 3 else 0.5), (NAN, NAN)) for n in range(6)]
+    made(Path("apart.mcap"), apart, silent=dict.fromkeys(range(3, 6), 9))
+    play(case, dxlrun)
 
 
-@pytest.mark.parametrize("to", FORMATS)
-def test_nothing_is_written_over_and_a_log_that_cannot_be_read_leaves_nothing(
-    run: Path, tmp_path: Path, export: Export, to: str
-) -> None:
-    there, broken = tmp_path / "there", tmp_path / "broken.mcap"
-    there.write_text("precious")
-    broken.write_bytes(b"not a log")
-    for log, out, sentence in (
-        (run, there, "there cannot be written (it exists"),
-        (broken, tmp_path / "out", f"{broken}: this is not an MCAP file"),
-        (run, tmp_path / "nowhere" / "out", "not found"),
-    ):
-        said = export(log, out, to)
-        (error,) = said.errors
-        assert (said.code, there.read_text(), sorted(tmp_path.iterdir())) == (2, "precious", [broken, there])
-        assert sentence in error
-
-
-def test_what_came_meanwhile_is_not_written_over(tmp_path: Path) -> None:
+def test_what_came_meanwhile_is_not_written_over(tmp_path):
     target = tmp_path / "out"
     context = new_target(target)
     context.__enter__().write_text("new")
@@ -211,8 +180,8 @@ def test_what_came_meanwhile_is_not_written_over(tmp_path: Path) -> None:
 
 
 def test_a_full_disk_leaves_nothing_and_without_pyarrow_one_sentence_has_the_command(
-    run: Path, tmp_path: Path, export: Export, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    run, tmp_path, export, monkeypatch
+):
     def full(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")
 
@@ -242,9 +211,7 @@ def renamed(log: Log, name: str) -> Log:
 @pytest.mark.parametrize(
     "topic", ["/a\0b", "/a\nb", "/../../out", "", "///", "/" + "x" * 400, "/\u202e", "/cycle/x"], ids=ascii
 )
-def test_a_topic_of_any_name_is_exported_or_refused_in_a_sentence(
-    run: Path, tmp_path: Path, export: Export, topic: str, to: str
-) -> None:
+def test_a_topic_of_any_name_is_exported_or_refused_in_a_sentence(run, tmp_path, export, topic, to):
     log, out = tmp_path / "odd.mcap", tmp_path / "out" / "out"
     write_changed(run, log, lambda read: renamed(read, topic))
     out.parent.mkdir()

@@ -1,7 +1,5 @@
 """Data sets hold what a policy is trained on, as LeRobotDataset v3.0 is described and as lerobot reads it."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
@@ -14,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from tests.analysis.export.conftest import NAN, ROBOTS, ROWS, Export, Row, made
+from tests.analysis.export.conftest import NAN, ROBOTS, ROWS, Row, made
 from tests.kit.answers import result_of
 from tests.kit.campaigns import campaign
 
@@ -42,7 +40,7 @@ def ramp(count: int) -> tuple[Row, ...]:
 
 
 @pytest.fixture(scope="module")
-def koch(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def koch(tmp_path_factory):
     """The log of a leader arm that moves, and of its follower."""
     path = tmp_path_factory.mktemp("koch") / "koch.mcap"
     arguments = {"leader_arm": "true", "leader_torque": "on"}
@@ -51,7 +49,7 @@ def koch(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_a_data_set_is_as_lerobot_describes_it(run: Path, tmp_path: Path, export: Export) -> None:
+def test_a_data_set_is_as_lerobot_describes_it(run, tmp_path, export):
     root = tmp_path / "set"
     assert export(run, root, "lerobot", "--fps", 50, "--task", "wave").code == 0
 
@@ -95,7 +93,7 @@ def test_a_data_set_is_as_lerobot_describes_it(run: Path, tmp_path: Path, export
         np.testing.assert_allclose(episode[f"stats/observation.state/{key}"], expected, rtol=1e-9)
 
 
-def test_followers_observe_and_their_leaders_act(koch: Path, tmp_path: Path, export: Export) -> None:
+def test_followers_observe_and_their_leaders_act(koch, tmp_path, export):
     root, log = tmp_path / "set", read_log(koch)
     assert export(koch, root, "lerobot", "--fps", 100).code == 0
     features = json.loads((root / "meta/info.json").read_text())["features"]
@@ -121,9 +119,7 @@ def test_followers_observe_and_their_leaders_act(koch: Path, tmp_path: Path, exp
         (80_000_000, (), list(range(21))),  # 12.5 Hz: 12 frames per second
     ],
 )
-def test_a_frame_has_the_newest_cycle_that_began_before_it(
-    tmp_path: Path, export: Export, period_ns: int, options: tuple[Any, ...], cycles: list[int]
-) -> None:
+def test_a_frame_has_the_newest_cycle_that_began_before_it(tmp_path, export, period_ns, options, cycles):
     """So nothing in an observation was measured after the action."""
     log = made(tmp_path / "a.mcap", ramp(22), period_ns=period_ns)
     assert export(log, tmp_path / "set", "lerobot", *options).code == 0
@@ -131,7 +127,7 @@ def test_a_frame_has_the_newest_cycle_that_began_before_it(
     np.testing.assert_allclose(states(tmp_path / "set", "action") - states(tmp_path / "set"), 0.5)
 
 
-def test_frames_begin_with_the_first_goal_and_skipped_periods_repeat(tmp_path: Path, export: Export) -> None:
+def test_frames_begin_with_the_first_goal_and_skipped_periods_repeat(tmp_path, export):
     log = made(tmp_path / "a.mcap", skipped={4: 2})
     said = export(log, tmp_path / "set", "lerobot", "--fps", 50, "--json")
     observed = np.array([[0.1, 1.0]] * 3 + [[0.2, 1.1], [0.3, 1.2]])
@@ -148,7 +144,7 @@ def test_frames_begin_with_the_first_goal_and_skipped_periods_repeat(tmp_path: P
     }
 
 
-def test_cycles_that_are_missing_end_an_episode(tmp_path: Path, export: Export) -> None:
+def test_cycles_that_are_missing_end_an_episode(tmp_path, export):
     """No frames are made up for them."""
     assert export(made(tmp_path / "a.mcap"), tmp_path / "set", "lerobot", "--fps", 50).code == 0
     data = frames(tmp_path / "set")
@@ -164,7 +160,7 @@ def test_cycles_that_are_missing_end_an_episode(tmp_path: Path, export: Export) 
     np.testing.assert_allclose(episodes[1]["stats/observation.state/mean"], [0.25, 1.15], rtol=1e-6)
 
 
-def test_a_lost_reply_is_held_and_a_silent_joint_ends_the_episode(tmp_path: Path, export: Export) -> None:
+def test_a_lost_reply_is_held_and_a_silent_joint_ends_the_episode(tmp_path, export):
     silent = {3: 1, **{number: number - 9 for number in range(10, 20)}}
     log = made(tmp_path / "a.mcap", ramp(24), silent=silent)
     said = export(log, tmp_path / "set", "lerobot", "--fps", 50)
@@ -176,14 +172,14 @@ def test_a_lost_reply_is_held_and_a_silent_joint_ends_the_episode(tmp_path: Path
     assert f"{log}: 2 episodes, because cycles or replies are missing for a time" in said.out
 
 
-def test_a_pause_ends_the_episode(tmp_path: Path, export: Export) -> None:
+def test_a_pause_ends_the_episode(tmp_path, export):
     rows = [*ramp(6), *((n, (n, n), (n, n), (NAN, NAN)) for n in range(14, 18))]
     log = made(tmp_path / "a.mcap", rows, skipped={14: 8})
     assert export(log, tmp_path / "set", "lerobot", "--fps", 50).code == 0
     assert frames(tmp_path / "set")["episode_index"].to_pylist() == [0] * 6 + [1] * 4
 
 
-def test_each_log_is_an_episode(koch: Path, tmp_path: Path, export: Export) -> None:
+def test_each_log_is_an_episode(koch, tmp_path, export):
     logs = [made(tmp_path / name, ramp(count)) for name, count in (("a.mcap", 5), ("b.mcap", 7))]
     assert export(logs[0], logs[1], tmp_path / "set", "lerobot", "--fps", 50).code == 0
     assert states(tmp_path / "set")[:, 0].tolist() == [*range(5), *range(7)]
@@ -197,13 +193,13 @@ def test_each_log_is_an_episode(koch: Path, tmp_path: Path, export: Export) -> N
     assert 240 < len(frames(tmp_path / "arms")) < 480
 
 
-def test_actions_are_those_of_the_joints_that_have_goals(tmp_path: Path, export: Export) -> None:
+def test_actions_are_those_of_the_joints_that_have_goals(tmp_path, export):
     rows = tuple((number, (0.1, 1.0), (NAN, 0.5), (NAN, NAN)) for number in range(2))
     assert export(made(tmp_path / "a.mcap", rows), tmp_path / "set", "lerobot", "--fps", 50).code == 0
     assert frames(tmp_path / "set")["action"].to_pylist() == [0.5, 0.5]
 
 
-def test_a_data_set_is_the_same_however_the_log_is_sliced(tmp_path: Path) -> None:
+def test_a_data_set_is_the_same_however_the_log_is_sliced(tmp_path):
     rows = (*ROWS, (6, (0.4, 1.3), (NAN, NAN), (1.0, NAN)))
     log = read_log(made(tmp_path / "a.mcap", rows, {4: 2}))
     sizes = (1, 2, 3, 9)
@@ -225,93 +221,12 @@ def test_a_data_set_is_the_same_however_the_log_is_sliced(tmp_path: Path) -> Non
 # What is refused
 
 
-@pytest.mark.parametrize(
-    ("words", "errors"),
-    [
-        ("a.mcap --fps 60", ["a.mcap: --fps 60 is above the rate of its loop, 50 Hz; give 50 or less"]),
-        ("a.mcap --fps 0", ["--fps 0: not a rate; give at least 1"]),
-        (
-            "a.mcap --action arn --observation both",
-            [
-                "a.mcap: --observation both: the robot has no joint or group of this name; known: arm, wheel",
-                "a.mcap: --action arn: the robot has no joint or group of this name; did you mean arm?",
-            ],
-        ),
-        (
-            "a.mcap other.mcap joints.mcap",
-            [
-                "other.mcap: a log of twin, but a.mcap is one of pair; give logs of one robot",
-                "joints.mcap: joints differ from those of a.mcap: arm, leg; give logs of one robot",
-            ],
-        ),
-        ("none.mcap gone.mcap", ["log none.mcap not found", "log gone.mcap not found"]),
-        ("broken.mcap empty.mcap", ["broken.mcap: this is not an MCAP file", "empty.mcap: "]),
-        ("a.mcap a.mcap", ["log a.mcap is given twice; give it once"]),
-        ("still.mcap", ["still.mcap: no joint had a goal; give a log of a run that moved joints"]),
-        (
-            "a.mcap still.mcap",
-            [
-                "still.mcap: no position goal of arm; omit this log, or name other joints by --observation",
-                "still.mcap: no velocity goal of wheel; omit this log",
-            ],
-        ),
-        ("deaf.mcap", ["deaf.mcap: no reply of arm; omit this log, or name other joints"]),
-        ("apart.mcap", ["apart.mcap: no frames: in no cycle all joints have a state and a goal"]),
-        ("", ["only set is given; give a log and then the output"]),
-    ],
-)
-def test_logs_that_cannot_be_a_data_set_are_refused(
-    tmp_path: Path, export: Export, monkeypatch: pytest.MonkeyPatch, words: str, errors: list[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    made(Path("a.mcap"))
-    made(Path("other.mcap"), robot="twin")
-    made(Path("joints.mcap"), joints=("wheel", "leg"))
-    made(Path("still.mcap"), [(n, (0.1, 1.0), (NAN, NAN), (NAN, NAN)) for n in range(3)])
-    made(Path("deaf.mcap"), [(n, (0.1, NAN), (NAN, 0.5), (NAN, NAN)) for n in range(3)])
-    # The joint has its goal after its last state has become too old.
-    apart = [(n, (0.1, 1.0), (0.1, NAN if n < 3 else 0.5), (NAN, NAN)) for n in range(6)]
-    made(Path("apart.mcap"), apart, silent=dict.fromkeys(range(3, 6), 9))
-    Path("broken.mcap").write_text("no log")
-    Path("empty.mcap").touch()
-    before = sorted(tmp_path.iterdir())
-    logs, _, options = words.partition(" --")
-    said = export(*logs.split(), "set", "lerobot", *(f"--{options}".split() if options else ()))
-    assert (said.code, sorted(tmp_path.iterdir())) == (2, before)
-    assert len(said.errors) == len(errors)
-    for found, expected in zip(said.errors, errors, strict=True):
-        assert found.removeprefix("dxlrun: ").startswith(expected)
-
-
-@pytest.mark.parametrize(
-    ("words", "error"),
-    [
-        ("a.mcap b.mcap out csv", "2 logs, but csv is of one; export one log at a time"),
-        ("a.mcap out parquet --fps 20", "--fps is only for lerobot; omit --fps"),
-        ("a.mcap out csv --action arm", "--action is only for lerobot; omit --action"),
-        (
-            "a.mcap out lerobot --topic /goals",
-            "--topic is only for csv, lerobot has all topics; omit --topic",
-        ),
-    ],
-)
-def test_an_option_of_another_format_is_refused(
-    tmp_path: Path, export: Export, monkeypatch: pytest.MonkeyPatch, words: str, error: str
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    for name in ("a.mcap", "b.mcap"):
-        made(Path(name))
-    assert export(*words.split()).errors == [f"dxlrun: {error}"]
-
-
 # lerobot itself
 
 
 @campaign(ci=0, night=0, release=1)
 @pytest.mark.skipif(not LEROBOT, reason="DXLRUN_LEROBOT_PYTHON names no Python with lerobot")
-def test_lerobot_loads_a_data_set_and_trains_act_on_it(
-    koch: Path, tmp_path: Path, export: Export, number: int
-) -> None:
+def test_lerobot_loads_a_data_set_and_trains_act_on_it(koch, tmp_path, export, number):
     second = tmp_path / "second.mcap"
     second.write_bytes(koch.read_bytes())
     assert export(koch, second, tmp_path / "set", "lerobot", "--task", "pick the cube").code == 0

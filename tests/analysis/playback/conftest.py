@@ -1,9 +1,5 @@
 """A robot of two joints, a log in which it moved, and foreign recordings written by other libraries."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import pytest
 
 from dxlrun.cli import main
@@ -46,7 +42,7 @@ motions:
 
 
 @pytest.fixture(scope="session")
-def swing(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def swing(tmp_path_factory):
     """The log of the motion."""
     place = tmp_path_factory.mktemp("swing")
     (place / "pair.yaml").write_text(ROBOT + f"recording: {{directory: {place / 'logs'}}}\n")
@@ -57,8 +53,9 @@ def swing(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A working directory with the robot."""
+def place(swing, tmp_path, monkeypatch):
+    """A working directory with the robot and its log."""
+    (tmp_path / "swing.mcap").symlink_to(swing)
     (tmp_path / "pair.yaml").write_text(ROBOT)
     monkeypatch.chdir(tmp_path)
     return tmp_path

@@ -1,9 +1,7 @@
 """Foreign recordings, written by other libraries: MCAP by mcap-ros2-support, ROS 2 bags by rosbags."""
 
-from __future__ import annotations
-
 import sqlite3
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -21,7 +19,6 @@ from dxlrun_analysis.playback.recorded_motion import Stretch
 from dxlrun_analysis.playback.sources import read_motion
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
-Dxlrun = Callable[..., Any]
 BEGAN_NS = 1_700_000_000_000_000_000
 Row = tuple[str, int, int, str, float]  # Topic, time of recording, stamp, joint, position
 
@@ -58,7 +55,7 @@ def recorded(path: Path, rows: Iterable[Row], **options: Any) -> Path:
 
 
 @pytest.fixture
-def foreign(tmp_path: Path) -> Path:
+def foreign(tmp_path):
     """JointStates of two joints that come in turns on one topic."""
     rows: list[Row] = []
     for index, (time, position) in enumerate(zip(*sine(), strict=True)):
@@ -70,7 +67,7 @@ def foreign(tmp_path: Path) -> Path:
     return recorded(tmp_path / "foreign.mcap", rows, chunk_size=2000)
 
 
-def test_joint_states_of_a_foreign_file(foreign: Path) -> None:
+def test_joint_states_of_a_foreign_file(foreign):
     motion = read_motion(foreign)
     assert motion.joints == ("pan", "tilt")
     assert motion.what == ("states", "states")
@@ -81,7 +78,7 @@ def test_joint_states_of_a_foreign_file(foreign: Path) -> None:
     assert np.abs(motion.position[:, 1] + 0.3 * np.sin(3 * times)).max() < 1e-3
 
 
-def test_it_is_played_on_a_robot_with_other_names(foreign: Path, place: Path, dxlrun: Dxlrun) -> None:
+def test_it_is_played_on_a_robot_with_other_names(foreign, place, dxlrun):
     words = ["replay", foreign, "--on", "pair.yaml", "--virtual", "--joint", "tilt", "--map", "tilt=pan"]
     done = dxlrun(*words)
     assert (done.code, "pair: played, 2.8 s of" in done.out) == (0, True), done
@@ -89,7 +86,7 @@ def test_it_is_played_on_a_robot_with_other_names(foreign: Path, place: Path, dx
 
 
 @pytest.mark.parametrize("storage", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
-def test_a_bag_of_ros_2(tmp_path: Path, storage: StoragePlugin) -> None:
+def test_a_bag_of_ros_2(tmp_path, storage):
     types = STORE.types
     path = tmp_path / "bag"
     with BagWriter(path, version=9, storage_plugin=storage) as bag:
@@ -121,7 +118,7 @@ def write_trajectory(
     bag.write(connection, t_ns, STORE.serialize_cdr(message, message.__msgtype__))
 
 
-def test_a_joint_in_several_topics_needs_a_choice(tmp_path: Path) -> None:
+def test_a_joint_in_several_topics_needs_a_choice(tmp_path):
     both = (("/leader", 1), ("/follower", -1))
     times = [(index, BEGAN_NS + index * 10**7) for index in range(20)]
     rows = [(name, t_ns, t_ns, "pan", sign * index) for index, t_ns in times for name, sign in both]
@@ -139,13 +136,13 @@ def test_a_joint_in_several_topics_needs_a_choice(tmp_path: Path) -> None:
         read_motion(path, what="goals")
 
 
-def test_a_file_without_such_messages_is_refused_with_what_it_has(tmp_path: Path) -> None:
+def test_a_file_without_such_messages_is_refused_with_what_it_has(tmp_path):
     path = recorded(tmp_path / "chatter.mcap", [("", BEGAN_NS, 0, "", 0.0)])
     with pytest.raises(InputError, match=r"chatter.mcap: no motion: .* topics are /chatter \(std_msgs/msg/S"):
         read_motion(path)
 
 
-def test_a_hole_is_named(tmp_path: Path) -> None:
+def test_a_hole_is_named(tmp_path):
     times = [BEGAN_NS + index * 10**7 for index in (*range(100), *range(300, 400))]
     path = recorded(tmp_path / "hole.mcap", [("/joint_states", t_ns, t_ns, "pan", 0.0) for t_ns in times])
     with pytest.raises(InputError, match=r"no positions of pan from 0.990 s to 3.000 s; choose a stretch"):
@@ -154,16 +151,14 @@ def test_a_hole_is_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("make", [lambda data: b"", lambda data: b"no recording", lambda data: data[:300]])
-def test_empty_wrong_and_half_files_are_one_sentence(
-    foreign: Path, tmp_path: Path, make: Callable[[bytes], bytes]
-) -> None:
+def test_empty_wrong_and_half_files_are_one_sentence(foreign, tmp_path, make):
     path = tmp_path / "wrong.mcap"
     path.write_bytes(make(foreign.read_bytes()))
     with pytest.raises(DxlrunError, match=r"^[^\n]*wrong.mcap[^\n]*$"):
         read_motion(path)
 
 
-def test_every_cut_and_some_flips_are_read_as_far_as_they_can(foreign: Path, tmp_path: Path) -> None:
+def test_every_cut_and_some_flips_are_read_as_far_as_they_can(foreign, tmp_path):
     """A chunk has 2000 bytes: behind the first one there is a motion."""
     data = foreign.read_bytes()
     path = tmp_path / "cut.mcap"
@@ -181,7 +176,7 @@ def test_every_cut_and_some_flips_are_read_as_far_as_they_can(foreign: Path, tmp
     assert 1.5 < longest < 2.1
 
 
-def test_wrong_bags_are_one_sentence(tmp_path: Path) -> None:
+def test_wrong_bags_are_one_sentence(tmp_path):
     bag = tmp_path / "bag"
     bag.mkdir()
     with pytest.raises(DxlrunError, match="bag"):
@@ -202,7 +197,7 @@ def test_wrong_bags_are_one_sentence(tmp_path: Path) -> None:
         read_motion(bag)
 
 
-def test_log_in_parts_or_in_a_bag_is_read_as_the_log(swing: Path, tmp_path: Path) -> None:
+def test_log_in_parts_or_in_a_bag_is_read_as_the_log(swing, tmp_path):
     parts = tmp_path / "parts"
     parts.mkdir()
     (parts / "part_0000.mcap").write_bytes(swing.read_bytes())

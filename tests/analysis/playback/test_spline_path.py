@@ -1,7 +1,5 @@
 """The path of a recorded motion: within the tolerance everywhere, without noise."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +25,7 @@ def motion(times: np.ndarray, *columns: np.ndarray) -> RecordedMotion:
     )
 
 
-def test_of_several_positions_at_one_time_the_last_counts() -> None:
+def test_of_several_positions_at_one_time_the_last_counts():
     series = Series(np.array([2.0, 1.0, 1.0, 0.0]), np.array([4.0, 1.0, 2.0, 3.0]), "states").ordered()
     assert (series.time_s.tolist(), series.position.tolist()) == ([0.0, 1.0, 2.0], [3.0, 2.0, 4.0])
 
@@ -38,7 +36,7 @@ numbers = st.floats(-3, 3, allow_nan=False)
 @given(
     st.lists(st.tuples(st.floats(1e-3, 0.5), numbers, numbers), min_size=2, max_size=60), st.floats(1e-3, 0.2)
 )
-def test_it_is_within_the_tolerance(moments: list[tuple[float, float, float]], tolerance: float) -> None:
+def test_it_is_within_the_tolerance(moments, tolerance):
     widths, first, second = (np.array(column) for column in zip(*moments, strict=True))
     times = np.cumsum(widths) - widths[0]
     path = fit(motion(times, first, second), np.array([tolerance, 2 * tolerance]))
@@ -50,7 +48,7 @@ def test_it_is_within_the_tolerance(moments: list[tuple[float, float, float]], t
     assert path.positions_at(dense).min() >= recorded.min() - 2 * tolerance
 
 
-def test_noise_below_the_tolerance_disappears() -> None:
+def test_noise_below_the_tolerance_disappears():
     """An AX-12A measures in steps of 0.29 deg: between two cycles that looks like 0.26 rad/s, or nothing."""
     times = np.arange(0.0, 10.0, 0.02)
     tick = np.radians(300 / 1023)
@@ -63,7 +61,7 @@ def test_noise_below_the_tolerance_disappears() -> None:
     assert worst[0] < 4
 
 
-def test_a_step_is_not_swung_beyond() -> None:
+def test_a_step_is_not_swung_beyond():
     times = np.arange(0.0, 1.0, 0.01)
     step = np.where(times < 0.5, 0.0, 1.0)
     path = fit(motion(times, step), np.array([0.002]))

@@ -1,7 +1,5 @@
 """A small robot whose plug-in depends on every input, and its log."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 
@@ -111,17 +109,17 @@ def dxlrun_controllers():
 
 
 @pytest.fixture(scope="session")
-def plugin(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def plugin(tmp_path_factory):
     return plugin_folder(tmp_path_factory.mktemp("plugin"), "all_inputs", PLUGIN, "all-inputs")
 
 
 @pytest.fixture(autouse=True)
-def _installed(plugin: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def _installed(plugin, monkeypatch):
     monkeypatch.syspath_prepend(plugin)
 
 
 @pytest.fixture(scope="session")
-def robot_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def robot_file(tmp_path_factory):
     path = tmp_path_factory.mktemp("robot") / "pair.yaml"
     path.write_text(ROBOT)
     path.with_name("look.yaml").write_text(MOTION)
@@ -129,7 +127,7 @@ def robot_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def run(robot_file: Path, tmp_path: Path) -> Callable[..., Path]:
+def run(robot_file, tmp_path):
     """Run the robot for a second on virtual time, return its log; `before` sees the robot before it runs."""
 
     def begin(before: Callable[[VirtualRobot], None], robot: Path = robot_file, seconds: float = 1.0) -> Path:
@@ -143,13 +141,13 @@ def run(robot_file: Path, tmp_path: Path) -> Callable[..., Path]:
 
 
 @pytest.fixture
-def changed(tmp_path: Path) -> Callable[..., Path]:
+def changed(tmp_path):
     """Write a changed copy of a log; tests/kit/changed_logs.py has the changes."""
     return lambda path, *changes, gaps=(): write_changed(path, tmp_path / "changed.mcap", *changes, gaps=gaps)
 
 
 @pytest.fixture(scope="session")
-def pair_log(plugin: Path, robot_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def pair_log(plugin, robot_file, tmp_path_factory):
     """The log of the robot's second, made once."""
     path = tmp_path_factory.mktemp("pair") / "run.mcap"
     with pytest.MonkeyPatch.context() as patch:

@@ -3,11 +3,8 @@
 CI tries 8 random runs; `pytest --campaign=release tests/analysis/replay/test_chains.py` tries more.
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import cache, partial
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,7 +16,6 @@ from tests.kit.changed_logs import flip, plan
 from tests.kit.packages import plugin_folder
 from tests.kit.stories import Asked, ask, differing, rate, replayed, send, silence, switch, tell, torque
 
-from dxlrun.channels.commands import CommandMessage
 from dxlrun.channels.event_records import EventCode
 from dxlrun.errors import InputError, LogError
 from dxlrun.log.log_reader import read_log
@@ -119,12 +115,12 @@ def dxlrun_controllers():
 
 
 @pytest.fixture(scope="module")
-def law(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def law(tmp_path_factory):
     return plugin_folder(tmp_path_factory.mktemp("law"), "law_plugin", PLUGIN, "law")
 
 
 @pytest.fixture(autouse=True)
-def _installed(law: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def _installed(law, monkeypatch):
     monkeypatch.syspath_prepend(law)
 
 
@@ -142,7 +138,7 @@ STORIES: Mapping[str, Asked] = {
 
 
 @pytest.fixture(scope="module")
-def story(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+def story(tmp_path_factory):
     """Return the log of a story, which is run once."""
     directory = tmp_path_factory.mktemp("chained")
     (directory / "chained.yaml").write_text(ROBOT)
@@ -154,11 +150,11 @@ def active(cycles: NDArray[np.void], row: int) -> set[str]:
 
 
 @pytest.mark.parametrize("name", STORIES)
-def test_a_run_of_chains(story: Callable[[str], Path], name: str) -> None:
+def test_a_run_of_chains(story, name):
     assert np.isfinite(replayed(story(name)).cycles["reference"]).any()
 
 
-def test_the_stories_do_what_they_are_there_for(story: Callable[[str], Path]) -> None:
+def test_the_stories_do_what_they_are_there_for(story):
     log = read_log(story("switches"))
     base = [f"base/{joint}/{name}" for name in ("position", "velocity") for joint in ("pan", "tilt", "nod")]
     assert log.header.references == (*base, "middle/pan/position", "middle/nod/position")
@@ -186,9 +182,7 @@ FLIPPED = [
 
 
 @pytest.mark.parametrize("flipped", FLIPPED, ids=[one[-1] for one in FLIPPED])
-def test_a_flipped_bit_of_a_reference_is_found_and_named(
-    story: Callable[[str], Path], changed: Callable[..., Path], flipped: tuple[int, int, str | None, str, str]
-) -> None:
+def test_a_flipped_bit_of_a_reference_is_found_and_named(story, changed, flipped):
     place, cycle, controller, joint, name = flipped
     report, first = differing(changed(story("a fallback"), flip("reference", cycle, place)))
     assert report.different == 1
@@ -198,16 +192,14 @@ def test_a_flipped_bit_of_a_reference_is_found_and_named(
     assert (one.joint, one.references, one.commands, one.goals) == (joint, 1, 0, 0)
 
 
-def test_another_parameter_above_differs_first_in_its_references(story: Callable[[str], Path]) -> None:
+def test_another_parameter_above_differs_first_in_its_references(story):
     report, first = differing(story("a restart"), "beside.gain=0.25")
     assert (first.what, first.controller) == ("reference base/tilt/position", "beside")
     (one,) = report.joints
     assert (one.joint, one.references >= one.commands > 0) == ("tilt", True)
 
 
-def test_other_references_than_those_of_the_log_are_refused(
-    story: Callable[[str], Path], changed: Callable[..., Path]
-) -> None:
+def test_other_references_than_those_of_the_log_are_refused(story, changed):
     with pytest.raises(InputError, match="base: the exported references differ"):
         replay_log(story("a restart"), [Setting.parse("base.exports=[position]")])
     other = plan(lambda content: content["loop"]["controllers"][1].update(reference=["position"]))
@@ -250,9 +242,7 @@ COMMANDS = st.one_of(
     st.dictionaries(st.integers(0, 45), st.lists(COMMANDS, min_size=1, max_size=4), max_size=12),
     st.sampled_from(((), (3,), (7,), (8,))),
 )
-def test_random_runs_of_chains(
-    law: Path, tmp_path: Path, asked: dict[int, list[CommandMessage]], silent: tuple[int, ...]
-) -> None:
+def test_random_runs_of_chains(law, tmp_path, asked, silent):
     (tmp_path / "chained.yaml").write_text(ROBOT)
     ended = {**asked, 60: [ask("resume")], 120: [ask("stop")]}  # a pause has no end
     before = partial(silence, servos=silent, begin_ms=300, end_ms=700)

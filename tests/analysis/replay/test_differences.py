@@ -1,7 +1,5 @@
 """A replay can fail: whatever is not the same is named, down to one bit; also messages, prepared arrays."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -18,15 +16,14 @@ from dxlrun.channels.commands import CommandMessage, encode_command
 from dxlrun.channels.tagged import decode
 from dxlrun.control.controllers.plugin_loading import load_plugins
 from dxlrun.description.motion import read_motion
-from dxlrun.errors import ControllerFault, InputError
+from dxlrun.errors import InputError
 from dxlrun.log.log_reader import read_log
 from dxlrun.remote.motion_requests import RunSnapshot, schedule_motion
 from dxlrun.remote.preparation import Preparation
 from dxlrun.testing import VirtualRobot, simulated_robot
-from dxlrun_analysis.replay import Setting, replay_log
+from dxlrun_analysis.replay import replay_log
 from dxlrun_controllers.motions.joint_trajectory_controller import JointTrajectoryController
 
-Changed = Callable[..., Path]
 JOINTS = ("pan", "tilt", "nod")
 OWNERS = ("head", "all_inputs", "all_inputs")
 ROBOTS = Path(__file__).parents[3] / "robots"
@@ -39,7 +36,7 @@ COMMAND, GOAL = "command of the {}", "goal of the {}, after the last gate"
 
 @pytest.mark.parametrize("field", ["command_position", "command_velocity", "goal_position", "goal_velocity"])
 @pytest.mark.parametrize("bit", [0, 31, 52, 63])
-def test_one_bit_of_one_value_is_named(pair_log: Path, changed: Changed, field: str, bit: int) -> None:
+def test_one_bit_of_one_value_is_named(pair_log, changed, field, bit):
     row, cycle, (kind, quantity) = bit % 3, 7 + bit % 40, field.split("_")
     report, first = differing(changed(pair_log, flip(field, cycle, row, bit)))
     assert (report.compared, report.different) == (50, 1)
@@ -51,7 +48,7 @@ def test_one_bit_of_one_value_is_named(pair_log: Path, changed: Changed, field: 
     assert (joint.joint, joint.commands, joint.goals) == (JOINTS[row], kind == "command", kind == "goal")
 
 
-def test_bits_of_nan_and_of_zero_count(pair_log: Path, changed: Changed) -> None:
+def test_bits_of_nan_and_of_zero_count(pair_log, changed):
     # tilt never gets a speed: what all_inputs left at NaN
     _, first = differing(changed(pair_log, flip("command_velocity", 12, 1, 63)))
     bits = "nan (bits 0xfff8000000000000)", "nan (bits 0x7ff8000000000000)"
@@ -64,7 +61,7 @@ def test_bits_of_nan_and_of_zero_count(pair_log: Path, changed: Changed) -> None
 
 
 @pytest.mark.parametrize("state", ["position", "velocity", "effort", "valid", "age_ns"])
-def test_every_recorded_state_is_an_input(pair_log: Path, changed: Changed, state: str) -> None:
+def test_every_recorded_state_is_an_input(pair_log, changed, state):
     otherwise = put("valid", (20, 2), False) if state == "valid" else add(state, (20, 2), 1000)
     report, first = differing(changed(pair_log, otherwise))
     assert (first.cycle, first.joint) == (20, "nod")
@@ -72,14 +69,14 @@ def test_every_recorded_state_is_an_input(pair_log: Path, changed: Changed, stat
 
 
 @pytest.mark.parametrize("values", ["position", "velocity", "effort", "goal_position", "goal_velocity"])
-def test_what_the_controllers_began_with_is_an_input(pair_log: Path, changed: Changed, values: str) -> None:
+def test_what_the_controllers_began_with_is_an_input(pair_log, changed, values):
     report, first = differing(changed(pair_log, put(values, (0, 2), 1.25, of="activation")))
     # what the controller published when it was activated
     assert (first.cycle, first.what) == (-1, f"message of {STATE}: sum[1]")
     assert [joint.joint for joint in report.joints] == ["nod"]
 
 
-def test_active_controllers_are_compared(pair_log: Path, changed: Changed) -> None:
+def test_active_controllers_are_compared(pair_log, changed):
     report, first = differing(changed(pair_log, put("active", 9, 0b110)))
     assert (first.cycle, first.what, first.joint, first.controller) == (9, "active", None, "states")
     assert (first.recorded, first.replayed) == ("not active", "active")
@@ -89,7 +86,7 @@ def test_active_controllers_are_compared(pair_log: Path, changed: Changed) -> No
 # Other parameters and arguments
 
 
-def test_another_parameter_is_seen_at_its_first_cycle(pair_log: Path) -> None:
+def test_another_parameter_is_seen_at_its_first_cycle(pair_log):
     report, first = differing(pair_log, "all_inputs.gain=0.5")
     assert (first.cycle, first.joint, first.controller) == (0, "tilt", "all_inputs")
     assert [(one.joint, one.commands) for one in report.joints] == [("tilt", 50), ("nod", 50)]
@@ -107,7 +104,7 @@ def test_another_parameter_is_seen_at_its_first_cycle(pair_log: Path) -> None:
     assert "all_inputs raised in update: RuntimeError: out of ideas" in report.fault
 
 
-def test_limit_of_the_gate_from_an_argument(pair_log: Path) -> None:
+def test_limit_of_the_gate_from_an_argument(pair_log):
     report = replay_log(pair_log, (), {"speed": "0.8 rad/s"})
     first = report.first
     assert first is not None
@@ -116,44 +113,8 @@ def test_limit_of_the_gate_from_an_argument(pair_log: Path) -> None:
     assert [(one.joint, one.commands) for one in report.joints if one.commands] == []
 
 
-@pytest.mark.parametrize(
-    ("wrong", "says"),
-    [
-        ("neck.gain=1", "no such controller; known: all_inputs, head, states"),
-        ("haed.gain=1", "did you mean head?"),
-        ("all_inputs.gian=1", "all_inputs has an unknown key 'gian'; did you mean gain?"),
-        ("all_inputs.gain=much", "all_inputs.gain is the text 'much', but must be a number"),
-        ("all_inputs.gain.low=1", "all_inputs.gain "),
-        ("all_inputs.joints.low=1", "joints is not a mapping"),
-        ("all_inputs.joints=[tail]", "joint tail of all_inputs is not defined"),
-        ("all_inputs.joints=[nod, nod]", "names joint nod twice"),
-        ("all_inputs.gain=[", "is not YAML"),
-        ("all_inputs.gain", "sets nothing"),
-        ("gain=1", "sets nothing"),
-        ({"rate": "100"}, "change the loop's period from 20000000 ns to 10000000 ns"),
-        ({"sped": "1 rad/s"}, "sped"),
-        ({"speed": "fast"}, "pair.yaml:"),
-    ],
-)
-def test_setting_or_argument_that_does_not_fit_is_one_sentence(
-    pair_log: Path, wrong: str | dict[str, str], says: str
-) -> None:
-    settings, arguments = ([wrong], {}) if isinstance(wrong, str) else ([], wrong)
-    with pytest.raises(InputError) as error:
-        replay_log(pair_log, [*map(Setting.parse, settings)], arguments)
-    assert says in str(error.value)
-    assert "replay-" not in str(error.value)
-    if isinstance(wrong, str):
-        assert "\n" not in str(error.value)
-
-
-def test_setting_that_claims_a_joint_of_another_controller(pair_log: Path) -> None:
-    with pytest.raises(ControllerFault, match="pan"):
-        replay_log(pair_log, [Setting.parse("all_inputs.joints=[pan, nod]")])
-
-
 @pytest.fixture
-def log_with_include(robot_file: Path, tmp_path: Path) -> Path:
+def log_with_include(robot_file, tmp_path):
     """The robot's log, whose controllers stood in a file above the robot's directory."""
     head, tail = robot_file.read_text().split("controllers:\n")
     robot, controllers, log = (tmp_path / n for n in ("robots/pair.yaml", "controllers.yaml", "run.mcap"))
@@ -166,16 +127,14 @@ def log_with_include(robot_file: Path, tmp_path: Path) -> Path:
     return log
 
 
-def test_included_files_and_the_urdf_come_from_the_log(log_with_include: Path, tmp_path: Path) -> None:
+def test_included_files_and_the_urdf_come_from_the_log(log_with_include, tmp_path):
     assert replay_log(log_with_include, (), {"speed": "5 rad/s"}).compared == 50
     torso = tmp_path / "torso.mcap"
     simulated_robot(ROBOTS / "bioloid_torso.yaml", duration_s=0.2, log=torso).run()
     assert replay_log(torso, (), {"rate": "50"}).same
 
 
-def test_file_outside_of_the_robots_directory_is_not_written(
-    log_with_include: Path, changed: Changed, tmp_path: Path
-) -> None:
+def test_file_outside_of_the_robots_directory_is_not_written(log_with_include, changed, tmp_path):
     target = tmp_path / "written.yaml"
     outside = "/".join([".."] * 40) + str(target)
     log = changed(log_with_include, plan(lambda content: content["included"].update({outside: "name: x"})))
@@ -184,7 +143,7 @@ def test_file_outside_of_the_robots_directory_is_not_written(
     assert not target.exists()
 
 
-def test_plan_that_the_file_no_longer_gives(pair_log: Path, changed: Changed) -> None:
+def test_plan_that_the_file_no_longer_gives(pair_log, changed):
     log = changed(pair_log, plan(lambda content: content["loop"]["joints"][1].update(upper=0.5)))
     with pytest.raises(InputError, match="now compiles to a different plan"):
         replay_log(log, (), {"speed": "5 rad/s"})
@@ -204,7 +163,7 @@ def flip_message(index: int, at: int, bit: int = 0) -> Change:
     return messages(STATE, edit)
 
 
-def test_messages_from_activation_to_deactivation_are_the_same(pair_log: Path, changed: Changed) -> None:
+def test_messages_from_activation_to_deactivation_are_the_same(pair_log, changed):
     assert len(read_log(pair_log).topics[STATE].data) == 52
     report = replay_log(pair_log)
     assert report.same
@@ -219,8 +178,8 @@ def test_messages_from_activation_to_deactivation_are_the_same(pair_log: Path, c
     [(0, 4, -1, "header.stamp.sec"), (1, 20, 0, "number"), (30, -8, 29, "sum[1]"), (51, -16, 49, "sum[0]")],
 )
 def test_one_bit_of_one_message_is_named(  # noqa: PLR0917  fixtures, and a case
-    pair_log: Path, changed: Changed, index: int, at: int, cycle: int, field: str
-) -> None:
+    pair_log, changed, index, at, cycle, field
+):
     report, first = differing(changed(pair_log, flip_message(index, at)))
     assert (report.different, report.different_messages) == (0, 1)
     assert (first.cycle, first.what) == (cycle, f"message of {STATE}: {field}")
@@ -228,7 +187,7 @@ def test_one_bit_of_one_message_is_named(  # noqa: PLR0917  fixtures, and a case
     assert report.sentence == f"pair: 50 cycles replayed, 1 of {report.messages} messages differs"
 
 
-def test_first_of_two_and_the_command_of_its_cycle_count(pair_log: Path, changed: Changed) -> None:
+def test_first_of_two_and_the_command_of_its_cycle_count(pair_log, changed):
     changes = flip_message(21, -8), flip_message(11, -8), add("command_position", (10, 1), 1.0)
     report, first = differing(changed(pair_log, *changes))
     assert (first.cycle, first.what) == (10, "command of the position")
@@ -244,15 +203,13 @@ def test_first_of_two_and_the_command_of_its_cycle_count(pair_log: Path, changed
     ],
     ids=["one less", "one more", "one more at the end"],
 )
-def test_message_in_one_of_the_two_only_is_a_difference(
-    pair_log: Path, changed: Changed, change: Callable[[Any], None], expected: tuple[int, str, str]
-) -> None:
+def test_message_in_one_of_the_two_only_is_a_difference(pair_log, changed, change, expected):
     report, first = differing(changed(pair_log, messages(STATE, change)))
     assert report.different_messages == 1
     assert (first.cycle, first.recorded, first.replayed) == expected
 
 
-def test_messages_that_the_recorder_lost_are_a_remark(pair_log: Path, changed: Changed) -> None:
+def test_messages_that_the_recorder_lost_are_a_remark(pair_log, changed):
     lost = messages(STATE, lambda found: found.__delitem__(slice(4, 8)))
     report = replay_log(changed(pair_log, lost, gaps=[("loop/messages", 4)]))
     assert report.same
@@ -291,9 +248,7 @@ def ask_often(robot: VirtualRobot) -> None:
     robot.inbox.drain_commands = drain_asked  # type: ignore[method-assign]
 
 
-def test_commands_of_clients_and_motions_are_prepared_again(
-    run: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_commands_of_clients_and_motions_are_prepared_again(run, monkeypatch):
     log = run(ask_often)
     report = replay_log(log)
     assert report.same
@@ -310,7 +265,7 @@ def refuse(array: object) -> None:
     raise ValueError("no such motion any more")
 
 
-def test_another_array_of_the_plan_is_named(pair_log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_array_of_the_plan_is_named(pair_log, monkeypatch):
     assert replay_log(pair_log).prepared == 1
     with monkeypatch.context() as patch:
         prepare_otherwise(patch, lambda array: array * 2)
@@ -332,13 +287,13 @@ def test_another_array_of_the_plan_is_named(pair_log: Path, monkeypatch: pytest.
         assert first.replayed == "no array (ValueError: no such motion any more)"
 
 
-def test_request_that_the_log_does_not_have_is_reported(pair_log: Path, changed: Changed) -> None:
+def test_request_that_the_log_does_not_have_is_reported(pair_log, changed):
     forget = plan(lambda content: [command.pop("request") for command in content["loop"]["commands"]])
     report = replay_log(changed(pair_log, forget))
     assert (report.same, report.prepared, report.unprepared) == (True, 0, 1)
 
 
-def test_request_is_left_out_where_there_is_no_room() -> None:
+def test_request_is_left_out_where_there_is_no_room():
     command = CommandMessage(7, "head", "positions", bytes(800), "anna", 5, b'{"positions":[1.0]}')
     assert decode(encode_command(command)) == command
     whole = len(encode_command(command))

@@ -3,8 +3,6 @@
 CI tries 4 random runs; `pytest --campaign=release tests/analysis/replay/test_steered.py` tries more.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -32,7 +30,6 @@ from dxlrun_analysis.replay import replay_log
 
 pytestmark = pytest.mark.long
 
-Changed = Callable[..., Path]
 MS = 1_000_000
 MORE = """\
   standby: {type: all_inputs, joints: [tilt, nod], gain: 1e-3, active: false}
@@ -83,7 +80,7 @@ STORIES: dict[str, Asked] = {
 
 
 @pytest.fixture(scope="module")
-def steer(robot_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
+def steer(robot_file, tmp_path_factory):
     """Run the robot for a second while clients ask of it; return the log."""
     directory, play = tmp_path_factory.mktemp("steered"), [robot_file.with_name("look.yaml")]
 
@@ -103,13 +100,13 @@ def steer(robot_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Callabl
 
 
 @pytest.fixture(scope="module")
-def tell(steer: Callable[..., Path]) -> Callable[[str], Path]:
+def tell(steer):
     """Return the log of a story, which is run once."""
     return cache(lambda name: steer(STORIES[name], edit=FALLS if name == "a fallback" else KEEPS, name=name))
 
 
 @pytest.mark.parametrize("story", STORIES)
-def test_a_steered_run(tell: Callable[[str], Path], story: str) -> None:
+def test_a_steered_run(tell, story):
     log = replayed(tell(story))
     asked = [command for _, commands in sorted(STORIES[story].items()) for command in commands]
     told = [(one.command.controller, one.command.kind, one.command.lease_ns) for one in client_commands(log)]
@@ -120,7 +117,7 @@ def test_a_steered_run(tell: Callable[[str], Path], story: str) -> None:
     ]
 
 
-def test_the_stories_do_what_they_are_there_for(tell: Callable[[str], Path]) -> None:
+def test_the_stories_do_what_they_are_there_for(tell):
     log = read_log(tell("rates"))
     assert set(np.diff(log.cycles["scheduled_ns"]).tolist()) == {20 * MS, 10 * MS, 5 * MS}
     log = read_log(tell("a fallback"))
@@ -147,7 +144,7 @@ ENDS = {
 
 
 @pytest.mark.parametrize("end", ENDS)
-def test_a_run_that_ended_by_a_policy(steer: Callable[..., Path], end: str) -> None:
+def test_a_run_that_ended_by_a_policy(steer, end):
     policies, asked = ENDS[end]
     edit = FAILS if end == "a fault" else KEEPS
     log = replayed(steer(asked, f"{POSES}\npolicies: {{exit_timeout: 4 s, {policies[1:]}\n", edit=edit))
@@ -159,9 +156,7 @@ def test_a_run_that_ended_by_a_policy(steer: Callable[..., Path], end: str) -> N
 
 @pytest.mark.parametrize("overrun", ["skip", "catch_up", "stop"])
 @pytest.mark.parametrize("lost", ["hold", "[{pose: home, speed: 60 deg/s}, limp]"])
-def test_late_cycles_and_lost_servos_while_it_is_steered(
-    steer: Callable[..., Path], overrun: str, lost: str
-) -> None:
+def test_late_cycles_and_lost_servos_while_it_is_steered(steer, overrun, lost):
     def silent(robot: VirtualRobot) -> None:
         silence(robot, (3, 7, 8), 400, 430)
         silence(robot, (3, 7, 8), 600, 900)
@@ -219,7 +214,7 @@ COMMANDS = st.one_of(
 @campaign(ci=4, night=100, release=1000)
 @settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.dictionaries(st.integers(0, 45), st.lists(COMMANDS, min_size=1, max_size=4), max_size=15))
-def test_any_sequence_of_commands(steer: Callable[..., Path], asked: dict[int, list[CommandMessage]]) -> None:
+def test_any_sequence_of_commands(steer, asked):
     replayed(steer({**asked, 60: [ask("stop")]}))  # a pause has no end
 
 
@@ -240,16 +235,14 @@ FLIPPED: dict[str, tuple[str, Change, int]] = {
 
 
 @pytest.mark.parametrize("flipped", FLIPPED)
-def test_a_flipped_command_is_found(tell: Callable[[str], Path], changed: Changed, flipped: str) -> None:
+def test_a_flipped_command_is_found(tell, changed, flipped):
     story, change, latest = FLIPPED[flipped]
     _, first = differing(changed(tell(story), change))
     assert first.cycle <= latest, first
 
 
 @pytest.mark.parametrize(("cycle", "owner"), [(5, "all_inputs"), (10, "standby")])
-def test_of_several_controllers_of_a_joint_the_active_one_is_named(
-    tell: Callable[[str], Path], changed: Changed, cycle: int, owner: str
-) -> None:
+def test_of_several_controllers_of_a_joint_the_active_one_is_named(tell, changed, cycle, owner):
     _, first = differing(changed(tell("switches"), flip("command_position", cycle, 1)))
     assert (first.cycle, first.joint, first.controller) == (cycle, "tilt", owner)
 
@@ -271,16 +264,12 @@ def test_of_several_controllers_of_a_joint_the_active_one_is_named(
         ),
     ],
 )
-def test_commands_that_cannot_be_are_damage(
-    tell: Callable[[str], Path], changed: Changed, story: str, change: Change, sentence: str
-) -> None:
+def test_commands_that_cannot_be_are_damage(tell, changed, story, change, sentence):
     with pytest.raises(LogError, match=sentence):
         replay_log(changed(tell(story), change))
 
 
-def test_nothing_is_compared_behind_a_lost_command_for_the_loop_or_cycles_around_another_rate(
-    tell: Callable[[str], Path], changed: Changed
-) -> None:
+def test_nothing_is_compared_behind_a_lost_command_for_the_loop_or_cycles_around_another_rate(tell, changed):
     lost = changed(tell("a pause in a motion"), no_commands("resume"), gaps=[("loop/commands", 1)])
     report = replay_log(lost)
     assert (report.compared, report.different) == (30, 0)
@@ -293,9 +282,7 @@ def test_nothing_is_compared_behind_a_lost_command_for_the_loop_or_cycles_around
     assert report.stopped.startswith("the log lacks cycles between 18 and 23")
 
 
-def test_what_is_refused_only_in_the_replay_is_reported(
-    tell: Callable[[str], Path], changed: Changed
-) -> None:
+def test_what_is_refused_only_in_the_replay_is_reported(tell, changed):
     change = command("load", data=msgspec.json.encode(structs.replace(LOADED, type="gone")))
     report, first = differing(changed(tell("a controller that is loaded"), change))
     assert report.remarks[0] == (
@@ -305,9 +292,7 @@ def test_what_is_refused_only_in_the_replay_is_reported(
     assert first.cycle == 5
 
 
-def test_a_policy_of_which_the_log_has_lost_the_beginning(
-    steer: Callable[..., Path], changed: Changed
-) -> None:
+def test_a_policy_of_which_the_log_has_lost_the_beginning(steer, changed):
     policies = "policies: {exit_timeout: 4 s, on_exit: [{pose: home, speed: 60 deg/s}, limp]}\n"
     log = steer({}, f"{POSES}\n{policies}")
     begun = policy_begun(read_log(log))
@@ -317,7 +302,7 @@ def test_a_policy_of_which_the_log_has_lost_the_beginning(
     assert report.stopped == f"the log lacks the start of a policy after cycle {begun.cycle - 1}"
 
 
-def test_a_bus_that_is_gone_before_the_policy(steer: Callable[..., Path]) -> None:
+def test_a_bus_that_is_gone_before_the_policy(steer):
     def pull(robot: VirtualRobot) -> None:
         (port,) = robot.robot.hardware._lines.ports.ports  # no face of a run pulls adapters
         robot.buses[0].at(500 * MS, port.unplug)

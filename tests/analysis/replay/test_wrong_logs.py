@@ -1,8 +1,5 @@
 """Logs with gaps, without an end, of other versions: what can be compared is, the rest is one sentence."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,10 +17,8 @@ from dxlrun.plan.recording_plan import RecordingPlan
 from dxlrun.testing import VirtualRobot, plan_of
 from dxlrun_analysis.replay import replay_log
 
-Changed = Callable[..., Path]
 
-
-def test_nothing_is_compared_behind_a_gap_or_a_lost_command(pair_log: Path, changed: Changed) -> None:
+def test_nothing_is_compared_behind_a_gap_or_a_lost_command(pair_log, changed):
     report = replay_log(changed(pair_log, without(*range(20, 25)), gaps=[("loop/cycles", 5)]))
     assert (report.cycles, report.compared, report.same) == (45, 20, True)
     assert report.stopped == (
@@ -90,7 +85,7 @@ def refused(log: Path, error: type[Exception] = LogError) -> str:
 
 
 @pytest.mark.parametrize("which", REFUSED)
-def test_log_that_cannot_be_replayed_is_one_sentence(pair_log: Path, changed: Changed, which: str) -> None:
+def test_log_that_cannot_be_replayed_is_one_sentence(pair_log, changed, which):
     change, sentence = REFUSED[which]
     path = changed(pair_log, change)
     assert sentence in refused(path)
@@ -98,9 +93,7 @@ def test_log_that_cannot_be_replayed_is_one_sentence(pair_log: Path, changed: Ch
         assert joints_of(read_log(path)) == {}
 
 
-def test_missing_plug_in_and_parameters_that_the_installed_one_refuses(
-    pair_log: Path, changed: Changed
-) -> None:
+def test_missing_plug_in_and_parameters_that_the_installed_one_refuses(pair_log, changed):
     path = changed(pair_log, of_controller("all_inputs", type="gone"))
     assert refused(path, PlugInError) == (
         f"{path}: no plug-in offers the type gone of controller all_inputs; install all-inputs 1.0"
@@ -112,7 +105,7 @@ def test_missing_plug_in_and_parameters_that_the_installed_one_refuses(
     )
 
 
-def test_other_versions_are_named(pair_log: Path, changed: Changed) -> None:
+def test_other_versions_are_named(pair_log, changed):
     older = plan_text((b"all-inputs 1.0", b"all-inputs 0.9"))
     numpy, plugin = replay_log(changed(pair_log, versions(numpy="1.0"), older)).remarks
     assert numpy == f"numpy has version 1.0 in the run and {np.__version__} in the replay"
@@ -120,9 +113,7 @@ def test_other_versions_are_named(pair_log: Path, changed: Changed) -> None:
     assert plugin == f"the controller type all_inputs {came}"
 
 
-def test_parts_are_replayed_from_the_first_one_only(
-    robot_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_parts_are_replayed_from_the_first_one_only(robot_file, tmp_path, capsys):
     plan = plan_of(robot_file, play=[robot_file.with_name("look.yaml")], duration_s=1.0)
     log = tmp_path / "run"
     VirtualRobot(structs.replace(plan, recording=RecordingPlan(split_ns=300_000_000)), log=log).run()
@@ -139,7 +130,7 @@ def test_parts_are_replayed_from_the_first_one_only(
         assert f"a replay {BEGINNING}begins with cycle 1" in sentence
 
 
-def test_log_that_ends_by_a_kill(tmp_path: Path, pair_log: Path) -> None:
+def test_log_that_ends_by_a_kill(tmp_path, pair_log):
     data, log = pair_log.read_bytes(), tmp_path / "killed.mcap"
     log.write_bytes(data[: data.index(b"dxlrun_summary") - 13])
     assert not read_log(log).complete

@@ -1,11 +1,7 @@
 """The page of a report in a browser: it loads nothing, says no error, and all plots zoom together."""
 
-from __future__ import annotations
-
 import json
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +11,6 @@ from tests.kit.made_logs import Cycle, Said, made_log
 from dxlrun.log.log_reader import read_log
 from dxlrun_analysis.page.report_page import analyzed_page
 
-Make = Callable[..., Any]
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed; apt install chromium")
 LOADED = "!!window.Bokeh && Bokeh.documents.length > 0 && Bokeh.documents[0].is_idle"
 FRAMES = """(() => {
@@ -35,7 +30,7 @@ FRAME = """(() => {
 
 
 @pytest.fixture(scope="module")
-def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def report(tmp_path_factory):
     """The page of a run of 300 cycles."""
     directory = tmp_path_factory.mktemp("page")
     cycles = [
@@ -49,7 +44,7 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def browser(report: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+def browser(report, tmp_path_factory):
     """The page in a browser, when its plots are drawn."""
     browser = Browser(tmp_path_factory.mktemp("browser"))
     browser("Page.navigate", url=report.as_uri())
@@ -58,7 +53,7 @@ def browser(report: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[
     browser.close()
 
 
-def test_the_page_says_no_error_and_loads_nothing(browser: Browser, report: Path) -> None:
+def test_the_page_says_no_error_and_loads_nothing(browser, report):
     assert browser.value(LOADED)
     loaded = {
         one["params"]["request"]["url"]
@@ -75,7 +70,7 @@ def test_the_page_says_no_error_and_loads_nothing(browser: Browser, report: Path
     assert troubles == []
 
 
-def test_a_zoom_in_one_plot_is_one_in_all(browser: Browser) -> None:
+def test_a_zoom_in_one_plot_is_one_in_all(browser):
     before = browser.value(FRAMES)
     timed = {name for name, shown in before.items() if shown == before["lateness"]}
     assert {"lateness", "steps", "controllers", "joint-0", "joint-1", "events-timeline"} <= timed | {
@@ -97,7 +92,7 @@ def test_a_zoom_in_one_plot_is_one_in_all(browser: Browser) -> None:
             assert shown == before[name]
 
 
-def test_the_plots_are_drawn(browser: Browser) -> None:
+def test_the_plots_are_drawn(browser):
     """Each has a canvas with more than one colour on it."""
     painted = """[...Bokeh.index].filter(one => one.frame).map(view => {
       const canvas = view.canvas_view.primary.canvas ?? view.canvas_view.primary.ctx.canvas;
@@ -109,7 +104,7 @@ def test_the_plots_are_drawn(browser: Browser) -> None:
     assert min(colours) > 10
 
 
-def test_a_click_on_a_name_hides_its_curve(browser: Browser) -> None:
+def test_a_click_on_a_name_hides_its_curve(browser):
     shown = """[...Bokeh.documents[0].roots().find(one => one.name === "joint-0").renderers]
       .filter(one => one.visible).map(one => one.name)"""
     click = (
@@ -124,7 +119,7 @@ def test_a_click_on_a_name_hides_its_curve(browser: Browser) -> None:
 
 
 @pytest.mark.parametrize(("width", "columns"), [(1900, 2), (1000, 1), (500, 1)])
-def test_the_width_of_the_window_is_used(browser: Browser, width: int, columns: int) -> None:
+def test_the_width_of_the_window_is_used(browser, width, columns):
     places = """["#joint-0", "#joint-1", "#lateness"].map(one => document.querySelector(one))
       .map(one => one.getBoundingClientRect()).map(one => [one.x, one.y, one.width])"""
     browser("Emulation.setDeviceMetricsOverride", width=width, height=900, deviceScaleFactor=1, mobile=False)

@@ -1,7 +1,5 @@
 """Analysis: what stands out among many samples stays visible in few columns and bins."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -15,7 +13,7 @@ VALUES = st.lists(st.one_of(st.floats(-1e6, 1e6), st.just(float("nan"))), min_si
 
 @settings(max_examples=60, deadline=None)
 @given(values=VALUES, columns=st.integers(1, 40))
-def test_each_column_keeps_its_smallest_and_largest_sample(values: list[float], columns: int) -> None:
+def test_each_column_keeps_its_smallest_and_largest_sample(values, columns):
     y = np.array(values)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(drawing, "_COLUMNS", columns)
@@ -60,9 +58,7 @@ def laid(
 
 @settings(max_examples=60, deadline=None)
 @given(slices=SLICES, most=st.integers(2, 20), width_ns=st.integers(1, 10**6))
-def test_bins_of_any_number_of_slices_hold_the_extremes_of_their_samples(
-    slices: list[list[tuple[int, float]]], most: int, width_ns: int
-) -> None:
+def test_bins_of_any_number_of_slices_hold_the_extremes_of_their_samples(slices, most, width_ns):
     rows, times, values = laid(slices, most, width_ns)
     assert len(rows.t_ns) <= most + most % 2
     assert np.isin(rows.t_ns, times).all()
@@ -76,7 +72,7 @@ def test_bins_of_any_number_of_slices_hold_the_extremes_of_their_samples(
             np.testing.assert_array_equal((rows.low[row, curve], rows.high[row, curve]), expected)
 
 
-def test_samples_that_come_late_go_into_the_bin_of_their_time() -> None:
+def test_samples_that_come_late_go_into_the_bin_of_their_time():
     envelope = Envelope(1, 4, 10)
     envelope.add_samples(np.array([100, 110, 120]), np.array([[1.0], [2.0], [3.0]], np.float32))
     envelope.add_samples(np.array([125, 112]), np.array([[9.0], [-9.0]], np.float32))
@@ -91,7 +87,7 @@ def rows_of(times: list[int]) -> EnvelopeRows:
     return EnvelopeRows(np.array(times, np.int64), values, values + 0.5)
 
 
-def test_in_a_window_each_sample_has_a_row_and_no_bin_hides_what_lies_behind_it() -> None:
+def test_in_a_window_each_sample_has_a_row_and_no_bin_hides_what_lies_behind_it():
     samples = np.array([20, 25, 30], np.int64), np.array([[7.0], [8.0], [9.0]], np.float32)
     rows = rows_of([0, 10, 20, 30, 40]).and_samples(*samples, [(20, 35)])
     assert rows.t_ns.tolist() == [0, 10, 20, 25, 30, 35, 40]
@@ -99,7 +95,7 @@ def test_in_a_window_each_sample_has_a_row_and_no_bin_hides_what_lies_behind_it(
     assert rows.high.ravel().tolist() == [0.5, 1.5, 7.0, 8.0, 9.0, 3.5, 4.5]
 
 
-def test_no_line_goes_across_a_long_time_without_samples() -> None:
+def test_no_line_goes_across_a_long_time_without_samples():
     rows = rows_of([0, 10, 500, 510]).with_gaps(100)
     assert rows.t_ns.tolist() == [0, 10, 11, 500, 510]
     np.testing.assert_array_equal(np.isnan(rows.low.ravel()), [False, False, True, False, False])

@@ -1,10 +1,7 @@
 """Analysis: the page of a report is well-formed, self-contained, complete, and says the report's numbers."""
 
-from __future__ import annotations
-
 import json
 import re
-from collections.abc import Callable
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -22,7 +19,6 @@ from dxlwire.packets import PacketKind
 
 pytestmark = pytest.mark.long
 
-Make = Callable[..., Any]
 _VOID = {"meta", "br", "img", "input", "link", "hr"}
 
 
@@ -71,7 +67,7 @@ def made(path: Path) -> Made:
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def run(tmp_path_factory):
     """A run with everything in it: late and skipped cycles, a lost reply, an error, a clamp, a fault."""
     rng = np.random.default_rng(3)
     cycles = [
@@ -96,7 +92,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def whole(run: Path) -> Made:
+def whole(run):
     return made(run)
 
 
@@ -107,7 +103,7 @@ def without_library(text: str) -> str:
     return text.replace(max(scripts, key=len), "")
 
 
-def test_the_page_is_well_formed_and_loads_nothing(whole: Made) -> None:
+def test_the_page_is_well_formed_and_loads_nothing(whole):
     text, reader = without_library(whole[0]), whole[1]
     assert text.startswith("<!DOCTYPE html>")
     assert "http://" not in text
@@ -119,7 +115,7 @@ def test_the_page_is_well_formed_and_loads_nothing(whole: Made) -> None:
     assert "link" not in {tag for tag, _, _ in reader.attributes}
 
 
-def test_references_inside_the_page_find_exactly_one_place(whole: Made) -> None:
+def test_references_inside_the_page_find_exactly_one_place(whole):
     _, reader = whole
     assert len(reader.ids) == len(set(reader.ids))
     wanted = {value[1:] for _, key, value in reader.attributes if key.endswith("href")}
@@ -127,7 +123,7 @@ def test_references_inside_the_page_find_exactly_one_place(whole: Made) -> None:
     assert wanted <= set(reader.ids)
 
 
-def test_each_plot_has_a_place_with_words_for_readers_who_cannot_see_it(whole: Made) -> None:
+def test_each_plot_has_a_place_with_words_for_readers_who_cannot_see_it(whole):
     text, reader = whole
     plots = data(text, "plots")
     (items,) = plots["items"]
@@ -141,7 +137,7 @@ def test_each_plot_has_a_place_with_words_for_readers_who_cannot_see_it(whole: M
     assert all(len(label) > 10 for label in labels)
 
 
-def test_the_plots_of_each_joint_and_of_the_thesis_are_there_in_degrees(run: Path, whole: Made) -> None:
+def test_the_plots_of_each_joint_and_of_the_thesis_are_there_in_degrees(run, whole):
     text, reader = whole
     joints, titles = read_log(run).joints, reader.words("h3")
     assert [title for title in titles if title in joints] == list(joints)
@@ -160,7 +156,7 @@ def test_the_plots_of_each_joint_and_of_the_thesis_are_there_in_degrees(run: Pat
     assert not re.search(r'"[a-z ]+, rad(/s)?"', text)
 
 
-def test_the_numbers_are_those_of_the_report(run: Path, whole: Made) -> None:
+def test_the_numbers_are_those_of_the_report(run, whole):
     text, reader = whole
     report = analyze(read_log(run))
     assert data(text, "report") == json.loads(json_text(report.numbers))
@@ -176,7 +172,7 @@ def test_the_numbers_are_those_of_the_report(run: Path, whole: Made) -> None:
         assert not finding.remedy or finding.remedy in reader.words("strong")
 
 
-def test_the_robot_comes_first_and_the_machine_is_folded_at_the_end(run: Path, whole: Made) -> None:
+def test_the_robot_comes_first_and_the_machine_is_folded_at_the_end(run, whole):
     text, reader = whole
     line = analyze(read_log(run)).verdict.findings[0].sentence
     assert line.startswith("Not good: ")
@@ -189,7 +185,7 @@ def test_the_robot_comes_first_and_the_machine_is_folded_at_the_end(run: Path, w
     assert text.index("<details>") < text.index("<caption>Run<")
 
 
-def test_findings_lead_to_their_plots(whole: Made) -> None:
+def test_findings_lead_to_their_plots(whole):
     text, reader = whole
     found = re.findall(r'<p>([^<]+)[^\n]*?<a href="#([^"]+)">', text.partition("<dl")[0])
     plots = {words.split(":")[0]: plot for words, plot in found}
@@ -198,7 +194,7 @@ def test_findings_lead_to_their_plots(whole: Made) -> None:
     assert set(plots.values()) <= set(reader.ids)
 
 
-def test_what_was_asked_of_the_system_and_granted_is_reported(whole: Made) -> None:
+def test_what_was_asked_of_the_system_and_granted_is_reported(whole):
     _, reader = whole
     cells = reader.words("th", "td")
     assert cells.count("granted") == 1
@@ -206,16 +202,14 @@ def test_what_was_asked_of_the_system_and_granted_is_reported(whole: Made) -> No
     assert "scheduler fifo 31 was refused" in cells
 
 
-def test_a_text_from_the_log_stays_a_text(whole: Made) -> None:
+def test_a_text_from_the_log_stays_a_text(whole):
     text, reader = without_library(whole[0]), whole[1]
     assert "<b>" not in text
     assert "\x1b" not in text
     assert "</script><b>ValueError</b> & \\x1b[31m" in reader.words("td")
 
 
-def test_a_log_of_nothing_but_nan_and_one_that_is_cut_give_a_page(
-    write: Make, run: Path, tmp_path: Path
-) -> None:
+def test_a_log_of_nothing_but_nan_and_one_that_is_cut_give_a_page(write, run, tmp_path):
     nan = float("nan")
     _, reader = made(write([Cycle(n, position=nan, goal=nan, valid=False) for n in range(3)]))
     assert "No goal was sent, or no position was read." in reader.words("figcaption")

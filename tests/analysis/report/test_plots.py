@@ -1,8 +1,5 @@
 """Analysis: each curve, bar and mark of a report's plots is the log's own data, computed here once more."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -20,14 +17,12 @@ from dxlrun_analysis.page.event_plots import EventCollector, events_plot
 from dxlrun_analysis.page.joint_plots import joint_plots
 from dxlrun_analysis.page.loop_plots import latency_plots
 from dxlrun_analysis.page.reply_collector import ReplyCollector
-from dxlrun_analysis.page.report_page import analyzed_page
 from dxlrun_analysis.page.run_curves import CurveCollector, CurvesOfRun, joint_curve
 from dxlrun_analysis.report import analyze
 from dxlwire.packets import PacketKind
 
 pytestmark = pytest.mark.long
 
-Make = Callable[..., Any]
 Data = NDArray[np.float64]
 COUNT, LONG = 40, 9000
 PERIOD_NS, START_NS = 20_000_000, 10**9
@@ -53,7 +48,7 @@ def filled(log: Log, count: int) -> Log:
 
 
 @pytest.fixture(scope="module")
-def logs(tmp_path_factory: pytest.TempPathFactory) -> dict[int, Log]:
+def logs(tmp_path_factory):
     """A short log, of which each sample is drawn, and a long one, of which most are in bins."""
     log = read_log(made_log(tmp_path_factory.mktemp("log"), [Cycle(number) for number in range(3)]))
     return {count: filled(log, count) for count in (COUNT, LONG)}
@@ -95,9 +90,7 @@ def seconds(log: Log) -> Data:
 
 @pytest.mark.parametrize("slices", [1, 7])
 @pytest.mark.parametrize("row", [0, 1])
-def test_each_sample_of_a_joint_is_on_the_curve_of_its_name(
-    logs: dict[int, Log], row: int, slices: int
-) -> None:
+def test_each_sample_of_a_joint_is_on_the_curve_of_its_name(logs, row, slices):
     log = logs[COUNT]
     run = collected(log, slices=slices)
     joint = analyze(log).totals.tracking[row]
@@ -125,9 +118,7 @@ def test_each_sample_of_a_joint_is_on_the_curve_of_its_name(
 
 
 @pytest.mark.parametrize("slices", [1, 50])
-def test_a_long_run_has_each_extreme_and_each_sample_around_its_worst_cycles(
-    logs: dict[int, Log], slices: int
-) -> None:
+def test_a_long_run_has_each_extreme_and_each_sample_around_its_worst_cycles(logs, slices):
     log = logs[LONG]
     due = log.cycles["scheduled_ns"]
     worst = (int(due[LONG // 3]), int(due[LONG // 3 + 20]), int(due[8000]))
@@ -153,7 +144,7 @@ def test_a_long_run_has_each_extreme_and_each_sample_around_its_worst_cycles(
     assert (run.cycles.high(name)[of[outside]] >= values[outside]).all()
 
 
-def test_the_distribution_of_the_wake_ups_counts_each(logs: dict[int, Log]) -> None:
+def test_the_distribution_of_the_wake_ups_counts_each(logs):
     log = logs[LONG]
     late = (log.cycles["woken_ns"] - log.cycles["scheduled_ns"]) / 1e3
     run = collected(log, slices=9)
@@ -178,7 +169,7 @@ def test_the_distribution_of_the_wake_ups_counts_each(logs: dict[int, Log]) -> N
         assert np.mean(floor < delay) < up_to < np.mean(floor <= delay)
 
 
-def test_reply_times_and_lost_replies_are_those_of_the_packets(write: Make) -> None:
+def test_reply_times_and_lost_replies_are_those_of_the_packets(write):
     ask, answer = bytes.fromhex("ffff0504022406ca"), bytes.fromhex("ffff05082000020000000000f0")
     packets = []
     for number in range(20):
@@ -198,7 +189,7 @@ def test_reply_times_and_lost_replies_are_those_of_the_packets(write: Make) -> N
     assert "reply main 21" not in replies
 
 
-def test_each_event_is_on_the_row_of_its_kind_with_its_text(write: Make) -> None:
+def test_each_event_is_on_the_row_of_its_kind_with_its_text(write):
     happened = [
         Said(EventCode.SCHEDULER, Severity.INFO, "one"),
         Said(EventCode.SCHEDULER, Severity.WARNING, "two"),
@@ -213,20 +204,3 @@ def test_each_event_is_on_the_row_of_its_kind_with_its_text(write: Make) -> None
     plot = events_plot(Canvas(0, 0, 10**9), events, 3)
     drawn = [(dict(data)["text"], dict(data)["y"].tolist()) for data, _ in glyphs(plot, "Scatter")]
     assert drawn == [(["head: one"], [0.0]), (["head: two"], [0.0]), (["head: three"], [1.0])]
-
-
-def test_the_report_of_a_log_read_in_slices_is_that_of_the_whole(logs: dict[int, Log]) -> None:
-    log = logs[COUNT]
-
-    class Sliced:
-        """The same log in slices."""
-
-        about = replace(log, cycles=log.cycles[:0])
-
-        def slices(self, *, packets: bool = True) -> list[Log]:
-            return [replace(log, cycles=part) for part in np.array_split(log.cycles, 5)]
-
-    sliced, page = analyzed_page(Sliced())  # type: ignore[arg-type]  # the part of a reader that is used
-    whole, expected = analyzed_page(log)
-    assert page == expected
-    assert (sliced.totals, sliced.verdict, sliced.numbers) == (whole.totals, whole.verdict, whole.numbers)

@@ -1,8 +1,5 @@
 """Analysis: the timelines of the worst cycles, the machine's samples and the joints' errors in plots."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -21,7 +18,6 @@ from dxlrun_analysis.page.run_curves import CurveCollector
 from dxlrun_analysis.page.worst_plots import worst_plots
 from dxlrun_analysis.report import analyze
 
-Make = Callable[..., Any]
 ASK = TimelinePacket("main", "instruction", 254, "", 1300.0, 1320.0, 1350.0, 14)
 REPLIES = (
     TimelinePacket("main", "status", 5, "elbow", 2000.0, 2100.0, 1900.0, 12),
@@ -57,7 +53,7 @@ def labels(plot: Plot) -> list[str]:
     return list(plot.model.yaxis[0].major_label_overrides.values())
 
 
-def test_a_worst_cycle_is_drawn_with_its_steps_its_packets_and_the_plan() -> None:
+def test_a_worst_cycle_is_drawn_with_its_steps_its_packets_and_the_plan():
     (plot,) = worst_plots(Canvas(0, 0, 10**9), [WORST])
     assert plot.title.startswith("Cycle 7, 0.140 s, 29.00 ms beyond the plan, then 1 period skipped")
     assert plot.title.endswith("late reply of servo 21 (head) 27.60 ms")
@@ -85,7 +81,7 @@ def test_a_worst_cycle_is_drawn_with_its_steps_its_packets_and_the_plan() -> Non
     assert [span.location for span in plot.model.center if hasattr(span, "location")] == [0.0, 20.0]
 
 
-def test_a_short_cycle_is_drawn_in_us_and_its_idle_step_is_left_out() -> None:
+def test_a_short_cycle_is_drawn_in_us_and_its_idle_step_is_left_out():
     short = replace(
         WORST, period_us=1000, woken_us=0, read_us=400, updated_us=500, written_us=600, packets=()
     )
@@ -125,7 +121,7 @@ def collected(*slices: Any) -> tuple[Any, tuple[int, ...]]:
     return collector.build_curves()
 
 
-def test_the_machine_is_drawn_as_it_was_sampled() -> None:
+def test_the_machine_is_drawn_as_it_was_sampled():
     late = sample(2, 2, steal=np.array([0.0, 0.25]), frequency=np.array([1e9, 3e9]), loop_waiting=0.3)
     curves, cores = collected(Samples(sample(1, 2)), Samples(late))
     assert cores == (1, 0)
@@ -143,9 +139,7 @@ def test_the_machine_is_drawn_as_it_was_sampled() -> None:
 
 
 @pytest.mark.parametrize("slices", [1, 4])
-def test_the_error_is_that_against_the_goal_of_the_cycle_before(
-    write: Make, slices: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_error_is_that_against_the_goal_of_the_cycle_before(write, slices, monkeypatch):
     monkeypatch.setattr("dxlrun_analysis.page.run_curves._AT_ONCE", 1)
     made = [Cycle(n, position=0.1 * n, goal=n * n, valid=n != 5) for n in range(12)]
     log: Log = read_log(write(made))
@@ -157,7 +151,7 @@ def test_the_error_is_that_against_the_goal_of_the_cycle_before(
     np.testing.assert_allclose(error, expected, rtol=1e-5)
 
 
-def test_the_page_has_timelines_and_the_machine(write: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_page_has_timelines_and_the_machine(write, monkeypatch):
     monkeypatch.setattr(
         MachineCollector, "add_slice", lambda collector, _: collector._add(sample(1, 2, temperature=55.0))
     )

@@ -1,11 +1,8 @@
 """`dxlrun upload` and tables of a store: whole logs only, none twice, none over another, and no log read."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import socket
-from collections.abc import Iterator
 from pathlib import Path
 
 import fsspec
@@ -34,7 +31,7 @@ def old(directory: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def made(tmp_path_factory):
     """Two logs and one in two parts, the second of which ends well before its time."""
     directory = tmp_path_factory.mktemp("made")
     (directory / "may").mkdir()
@@ -46,7 +43,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def logs(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def logs(made, tmp_path, monkeypatch):
     """The same in a directory of the test, which keeps its tables there too; this process reads the logs."""
     monkeypatch.setattr(
         season_runs, "_together", lambda logs, *_: {log.name: season_runs.row_of(log) for log in logs}
@@ -56,7 +53,7 @@ def logs(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.fixture
-def there(tmp_path: Path) -> Path:
+def there(tmp_path):
     """The directory of a store."""
     return tmp_path / "there"
 
@@ -81,9 +78,7 @@ def report(dxlrun: Dxlrun, log: object) -> dict[str, object]:
     return result_of(dxlrun("analyze", log, "--json").out) | {"log": ""}
 
 
-def test_a_store_has_the_table_of_its_directory_without_a_byte_of_a_log(
-    logs: Path, there: Path, dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_store_has_the_table_of_its_directory_without_a_byte_of_a_log(logs, there, dxlrun, monkeypatch):
     url, (expected, _) = f"file://{there}", rows(dxlrun, logs)
 
     assert told(dxlrun, logs, url) == {"uploaded": NAMES}
@@ -102,9 +97,7 @@ def test_a_store_has_the_table_of_its_directory_without_a_byte_of_a_log(
         assert report(dxlrun, f"{url}/{name}") == report(dxlrun, logs / name)
 
 
-def test_an_upload_that_ends_anywhere_goes_on_and_never_shows_half_a_log(
-    logs: Path, there: Path, dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_upload_that_ends_anywhere_goes_on_and_never_shows_half_a_log(logs, there, dxlrun, monkeypatch):
     """Each call of the store fails once; nothing is a row before it is there as a whole."""
     shutil.rmtree(logs / "may")
     url, (expected, _) = f"file://{there}", rows(dxlrun, logs)
@@ -146,9 +139,7 @@ def test_an_upload_that_ends_anywhere_goes_on_and_never_shows_half_a_log(
     assert calls == 5  # three files and two rows
 
 
-def test_what_a_robot_writes_still_waits_and_no_other_run_is_written_over(
-    logs: Path, there: Path, dxlrun: Dxlrun
-) -> None:
+def test_what_a_robot_writes_still_waits_and_no_other_run_is_written_over(logs, there, dxlrun):
     url = f"file://{there}"
     with being_written(logs / "one.mcap"):
         assert told(dxlrun, logs, url) == {"uploaded": ["may/second.mcap", "parts"], "written": ["one.mcap"]}
@@ -174,9 +165,7 @@ def test_what_a_robot_writes_still_waits_and_no_other_run_is_written_over(
     assert rows(dxlrun, url)[0][1]["began"] == "2025-11-24T09:00:00"
 
 
-def test_a_log_that_grows_while_it_is_copied_has_no_row(
-    logs: Path, there: Path, dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_log_that_grows_while_it_is_copied_has_no_row(logs, there, dxlrun, monkeypatch):
     files, url = type(fsspec.filesystem("file")), f"file://{there}"
     true = files.put_file
 
@@ -191,26 +180,8 @@ def test_a_log_that_grows_while_it_is_copied_has_no_row(
     assert list(there.rglob("*.json")) == []
 
 
-@pytest.mark.parametrize(
-    ("words", "code", "sentence"),
-    [
-        (("logs", "gopher://hole"), 2, "unknown kind of store; write s3://BUCKET/PREFIX"),
-        (("logs", "file:///nowhere/at/all"), 2, "`dxlrun upload DIRECTORY file:///nowhere/at/all`"),
-        (("upload", "nowhere", "file:///tmp/x"), 2, "directory nowhere not found"),
-        (("analyze", "file:///nowhere.mcap"), 1, "/nowhere.mcap"),
-        (("upload", "LOGS", "file://"), 2, "bucket or directory is missing"),
-    ],
-)
-def test_what_is_no_store_is_one_sentence(
-    logs: Path, dxlrun: Dxlrun, words: tuple[str, ...], code: int, sentence: str
-) -> None:
-    said = dxlrun(*(logs if word == "LOGS" else word for word in words))
-    assert (said.code, len(said.errors)) == (code, 1), said
-    assert sentence in said.errors[0]
-
-
 @pytest.fixture
-def bucket(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+def bucket(monkeypatch):
     """The URL of a bucket on a server that speaks S3."""
     pytest.importorskip("s3fs", reason="needs dxlrun[store]")
     server = pytest.importorskip("moto.server", reason="needs moto[server,s3], a server of S3")
@@ -225,7 +196,7 @@ def bucket(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     running.stop()
 
 
-def test_a_server_of_s3(logs: Path, dxlrun: Dxlrun, bucket: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_server_of_s3(logs, dxlrun, bucket, monkeypatch):
     expected, _ = rows(dxlrun, logs)
     assert told(dxlrun, logs, bucket) == {"uploaded": NAMES}
     assert told(dxlrun, logs, bucket) == {"there": NAMES}

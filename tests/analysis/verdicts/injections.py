@@ -4,8 +4,6 @@ A line may begin with a time, `from 2 s on` or `at 2 s`, and end with `every 0.5
 pattern of the rest gets the numbers and words of its groups, and is called when its kind says so.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from functools import partial

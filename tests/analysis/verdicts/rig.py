@@ -3,13 +3,9 @@
 The log of a run has names of real adapters: remedies for simulated ones may omit the hardware.
 """
 
-from __future__ import annotations
-
 import itertools
 import json
 import math
-import subprocess
-import sys
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -19,7 +15,6 @@ from typing import Any
 
 import pytest
 from msgspec.structs import replace
-from tests.kit.awaited import DEADLINE_S
 from tests.kit.bus_ports import BusPorts
 from tests.kit.line_faults import change_replies, watch_instructions
 
@@ -141,8 +136,6 @@ class Story:
         """What really happened, by kind; a case that left nothing here is worthless."""
         self.checks: list[Callable[[Log], None]] = []
         self.motion: Spec | None = self.swing()
-        self.disturb: Callable[[subprocess.Popen[str]], str] | None = None
-        """What happens on the machine while it runs in real time, and what it was; None: on virtual time."""
         self.prepared: list[Callable[[], object]] = []
         """Called once the robot is built: there are buses and servos then."""
         self.virtual: VirtualRobot
@@ -313,17 +306,19 @@ class Story:
 
     # The run
 
-    def run(self) -> Path:
-        """Run it, prove that what was injected happened, and return the log."""
-        file, log = self.directory / "robot.yaml", self.directory / "run.mcap"
+    def write_files(self) -> tuple[Path, list[Path]]:
+        """Write the robot file, and its motion if there is one."""
+        file, played = self.directory / "robot.yaml", []
         self.spec["recording"] = {"directory": str(self.directory)}
         file.write_text(json.dumps(self.spec, indent=1))
-        played = []
         if self.motion is not None:
             played = [self.directory / "motion.yaml"]
             played[0].write_text(json.dumps(self.motion, indent=1))
-        if self.disturb is not None:
-            return self._run_live(file, played, self.disturb)
+        return file, played
+
+    def run(self) -> Path:
+        """Run it, prove that what was injected happened, and return the log."""
+        (file, played), log = self.write_files(), self.directory / "run.mcap"
         header = virtual_run.log_header
 
         def as_of_a_robot(plan: Any, *words: Any, **options: Any) -> Any:
@@ -345,23 +340,6 @@ class Story:
         for check in self.checks:
             check(read)
         return log
-
-    def _run_live(self, file: Path, played: Sequence[Path], disturb: Callable[..., str]) -> Path:
-        """Run it in real time by the command line, on simulated buses that are called so."""
-        command = [str(Path(sys.executable).with_name("dxlrun")), str(file), "--no-gateway"]
-        command += ["--duration", f"{self.duration_s:g}"]
-        command += [word for motion in played for word in ("--play", str(motion))]
-        with subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-        ) as process:
-            try:
-                self.evidence[disturb(process)] += 1
-                said, _ = process.communicate(timeout=DEADLINE_S)
-            finally:
-                process.kill()
-        logs = list(self.directory.glob("*.mcap"))
-        assert logs, said
-        return logs[0]
 
 
 def instead(owner: object, name: str, make: Callable[[Any], Any]) -> None:

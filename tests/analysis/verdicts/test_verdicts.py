@@ -4,9 +4,6 @@ Each number of the campaign draws a pair of a case and a robot; `--campaign=rele
 includes pairs whose cause is known not to be named: such a pair has to stay unnamed, or lose that line.
 """
 
-from __future__ import annotations
-
-import random
 from pathlib import Path
 
 import pytest
@@ -28,7 +25,7 @@ def check(case: Case, robot: str, directory: Path) -> None:
     assert bool(found.wrong) == (robot in case.unnamed), f"{case.place}: {robot}: {case.happens}\n{found}"
 
 
-def test_every_case_says_what_happens(tmp_path: Path) -> None:
+def test_every_case_says_what_happens(tmp_path):
     assert len({case.name for case in CASES}) == len(CASES) > 50
     for case, robot in PAIRS:
         assert case.happens.endswith(".")
@@ -38,9 +35,7 @@ def test_every_case_says_what_happens(tmp_path: Path) -> None:
 
 
 @campaign(ci=4, night=30, release=len(PAIRS))
-def test_verdict_names_the_cause_and_accuses_no_innocent(
-    number: int, amount: float, chance: random.Random, tmp_path: Path
-) -> None:
+def test_verdict_names_the_cause_and_accuses_no_innocent(number, amount, chance, tmp_path):
     case, robot = PAIRS[number] if amount == len(PAIRS) else chance.choice(DRAWN)
     print(case.place, case.name, robot)
     check(case, robot, tmp_path)
@@ -48,9 +43,7 @@ def test_verdict_names_the_cause_and_accuses_no_innocent(
 
 @campaign(ci=1, night=4, release=4)
 @pytest.mark.parametrize("case", LOSSES, ids=lambda case: case.name)
-def test_missing_and_late_replies_are_those_of_the_part_that_fails(
-    case: Case, amount: int, tmp_path: Path
-) -> None:
+def test_missing_and_late_replies_are_those_of_the_part_that_fails(case, amount, tmp_path):
     """`amount` is the number of robots."""
     assert case.robots
     for robot in case.robots[:amount]:
@@ -68,7 +61,7 @@ def test_missing_and_late_replies_are_those_of_the_part_that_fails(
         ),
     ],
 )
-def test_mistake_in_a_case_is_named_with_its_line(text: str, told: str, tmp_path: Path) -> None:
+def test_mistake_in_a_case_is_named_with_its_line(text, told, tmp_path):
     (tmp_path / "bad.txt").write_text(text)
     with pytest.raises(ValueError, match=told):
         [case.prepare("x_fast", tmp_path) for case in read_cases(tmp_path / "bad.txt")]

@@ -1,8 +1,8 @@
-"""`dxlrun replay LOG --on ROBOT.yaml`: what is played, what is refused, and how it ends."""
+"""Recordings that `dxlrun replay --on` plays on a robot, and that `dxlrun convert` makes motion files of."""
 
-from __future__ import annotations
-
+import math
 import os
+import re
 import signal
 import threading
 from collections.abc import Callable, Mapping
@@ -11,14 +11,18 @@ from typing import Any
 
 import numpy as np
 import pytest
+from msgspec import structs
 from tests.kit.answers import result_of
 from tests.kit.changed_logs import put, write_changed
+from tests.kit.commands import cases, play
 
 from dxlrun import ROTARY
+from dxlrun.description.motion import read_motion as read_motion_file
 from dxlrun.errors import InputError
 from dxlrun.log.log_reader import Log, read_log
-from dxlrun.plan.loop_plan import JointPlan
+from dxlrun.plan.loop_plan import ControllerPlan, JointPlan
 from dxlrun.plan.robot_plan import Plan
+from dxlrun_analysis.playback.motion_file import motion_file
 from dxlrun_analysis.playback.recorded_motion import RecordedMotion
 from dxlrun_analysis.playback.rows import PlaybackRows, rows_of
 from dxlrun_analysis.playback.sources import read_motion
@@ -26,6 +30,7 @@ from dxlrun_lab.commands import on_robot
 from dxlrun_lab.guided import virtual_rig
 
 pytestmark = pytest.mark.long
+
 
 Dxlrun = Callable[..., Any]
 
@@ -41,7 +46,7 @@ def goals(log: Log, joint: str) -> tuple[np.ndarray, np.ndarray]:
     return (cycles["scheduled_ns"] - cycles["scheduled_ns"][0]) * 1e-9, cycles["goal_position"][:, row]
 
 
-def test_the_recorded_goals_are_sent_again(swing: Path, place: Path, dxlrun: Dxlrun) -> None:
+def test_the_recorded_goals_are_sent_again(swing, place, dxlrun):
     """Behind the first 0.3 s, in which the motion becomes as fast as it was recorded."""
     done = dxlrun("replay", swing, "--on", "pair.yaml", "--virtual", "--json")
     assert done.code == 0, done
@@ -59,7 +64,7 @@ def test_the_recorded_goals_are_sent_again(swing: Path, place: Path, dxlrun: Dxl
         assert best < np.radians(0.2), joint
 
 
-def test_half_the_speed_a_stretch_and_other_joints(swing: Path, place: Path, dxlrun: Dxlrun) -> None:
+def test_half_the_speed_a_stretch_and_other_joints(swing, place, dxlrun):
     words = "--from 1 --to 2 --speed 0.5 --map pan=tilt --map tilt= --json --virtual"
     done = dxlrun("replay", swing, "--on", "pair.yaml", *words.split())
     assert done.code == 0, done
@@ -74,42 +79,18 @@ def test_half_the_speed_a_stretch_and_other_joints(swing: Path, place: Path, dxl
     assert np.ptp(still) < 1e-6
 
 
+@pytest.mark.parametrize("case", cases(Path(__file__).with_name("refusals.txt")))
+def test_refused(place, dxlrun, case):
+    play(case, dxlrun)
+
+
 def refused(dxlrun: Dxlrun, *words: object) -> list[str]:
     done = dxlrun("replay", *words)
     assert (done.code, done.out) == (2, ""), done
     return [str(line) for line in done.err.splitlines()]
 
 
-def test_joints_that_the_robot_lacks_are_named_with_near_ones(
-    swing: Path, place: Path, dxlrun: Dxlrun
-) -> None:
-    other = (place / "pair.yaml").read_text().replace("pan", "pen").replace("tilt", "lift")
-    (place / "other.yaml").write_text(other)
-    pan, tilt = refused(dxlrun, swing, "--on", "other.yaml")
-    fix = "write --map pan=JOINT, or --map pan= to omit it"
-    assert pan == f"dxlrun: {swing}: the robot has no joint pan; did you mean pen?; {fix}"
-    assert tilt.endswith(f"no joint tilt; known: lift, pen; {fix.replace('pan', 'tilt')}")
-
-
-def test_what_is_beyond_limits_is_named_all_at_once_before_anything_starts(
-    swing: Path, place: Path, dxlrun: Dxlrun
-) -> None:
-    narrow = (
-        (place / "pair.yaml").read_text().replace("[-60 deg, 60 deg]", "[-20 deg, 20 deg], velocity: 6 rad/s")
-    )
-    (place / "narrow.yaml").write_text(narrow.replace("30 rad", "1 rad"))
-    position, speed, acceleration = refused(dxlrun, swing, "--on", "narrow.yaml", "--speed", 5)
-    assert f"{swing}: at " in position
-    assert "s pan is at 22.8" in position.replace("-", "")
-    assert position.endswith("deg, beyond its limits of -20 to 20 deg")
-    assert "s pan moves at 7." in speed
-    assert speed.endswith("rad/s, more than its 6 rad/s")
-    assert "s tilt accelerates with 6" in acceleration
-    assert acceleration.endswith("rad/s^2, more than its 1 rad/s^2")
-    assert not (place / "logs").exists()
-
-
-def test_a_speed_that_is_slow_enough_is_named(swing: Path, place: Path, dxlrun: Dxlrun) -> None:
+def test_a_speed_that_is_slow_enough_is_named(swing, place, dxlrun):
     slow = (place / "pair.yaml").read_text().replace("60 deg]}", "60 deg], velocity: 1 rad/s}")
     (place / "slow.yaml").write_text(slow)
     _, fix = refused(dxlrun, swing, "--on", "slow.yaml")
@@ -119,49 +100,7 @@ def test_a_speed_that_is_slow_enough_is_named(swing: Path, place: Path, dxlrun: 
     assert dxlrun("replay", swing, "--on", "slow.yaml", "--speed", enough, "--virtual").code == 0
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["--speed", "20"], "--speed 20: give a factor from 0.01 to 10"),
-        (["--speed", "nan"], "--speed nan: give a factor"),
-        (["--from", "-1"], "--from -1: give seconds since the start of the recording"),
-        (["--from", "3", "--to", "2"], "--from 3 is not before --to 2"),
-        (["--from", "100"], "no motion between --from and --to; choose times from 0.000 s"),
-        (["--map", "pan"], "--map pan: write RECORDED=JOINT"),
-        (["--map", "pan=tilt"], "--map gives several recorded joints the name tilt"),
-        (["--map", "pin=tilt"], "--map pin: the recording has no joint pin; did you mean pan?"),
-        (["--joint", "pin"], "--joint pin: the recording has no joint pin; did you mean pan?"),
-        (["--map", "pan=", "--map", "tilt="], "no joint is left to play"),
-        (["--tolerance", "x"], "--tolerance x"),
-        (["--tolerance", "20deg"], "--tolerance 20deg: give an angle above 0 and up to 10 deg"),
-        (["--topic", "/x"], "--topic /x: "),
-        (["--set", "both.speed=1"], "--set and --on exclude each other"),
-    ],
-)
-def test_wrong_words_are_refused(
-    swing: Path, place: Path, dxlrun: Dxlrun, words: list[str], said: str
-) -> None:
-    (line,) = refused(dxlrun, swing, "--on", "pair.yaml", *words)
-    assert said in line
-
-
-def test_options_of_playing_need_a_robot(swing: Path, dxlrun: Dxlrun) -> None:
-    (line,) = refused(dxlrun, swing, "--speed", "2", "--from", "1")
-    assert line == "dxlrun: --speed, --from can only be used with --on; add --on ROBOT.yaml"
-
-
-def test_no_log_an_empty_one_and_a_directory(place: Path, dxlrun: Dxlrun) -> None:
-    (place / "empty.mcap").touch()
-    (place / "else").mkdir()
-    (place / "else" / "notes.txt").write_text("x")
-    for name in ("none.mcap", "empty.mcap", "else"):
-        (line,) = refused(dxlrun, name, "--on", "pair.yaml")
-        assert name in line
-
-
-def test_real_joints_are_asked_about_before_a_run_is_started(
-    swing: Path, place: Path, dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_real_joints_are_asked_about_before_a_run_is_started(swing, place, dxlrun, monkeypatch):
     real = (place / "pair.yaml").read_text().replace("port: sim", "port: /dev/ttyUSB0")
     (place / "real.yaml").write_text(real.replace("2.0,", "2.0, adapter: {latency: 1 ms},"))
     with open(os.devnull) as stdin:
@@ -177,7 +116,7 @@ def test_real_joints_are_asked_about_before_a_run_is_started(
     assert "(nothing was moved); add --yes" in done.err
 
 
-def test_joints_are_led_slowly_to_a_first_pose_that_is_far(swing: Path, place: Path, dxlrun: Dxlrun) -> None:
+def test_joints_are_led_slowly_to_a_first_pose_that_is_far(swing, place, dxlrun):
     time_s, sent = goals(read_log(swing), "tilt")
     widest = int(np.abs(sent).argmax())
     done = dxlrun("replay", swing, "--on", "pair.yaml", "--virtual", "--json", "--from", time_s[widest])
@@ -191,9 +130,7 @@ def test_joints_are_led_slowly_to_a_first_pose_that_is_far(swing: Path, place: P
 
 
 @pytest.mark.parametrize("cycle", [60, 230], ids=["on the way to the first pose", "in the motion"])
-def test_a_joint_that_is_lost_ends_it_and_the_others_stay(
-    swing: Path, place: Path, dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch, cycle: int
-) -> None:
+def test_a_joint_that_is_lost_ends_it_and_the_others_stay(swing, place, dxlrun, monkeypatch, cycle):
     usual = virtual_rig.VirtualLink
 
     def losing(plan: Plan, **more: Any) -> object:
@@ -227,7 +164,7 @@ def rows(position: np.ndarray, seconds: float = 2.0, **limits: Any) -> PlaybackR
     return rows_of(motion(position, seconds), {"pan": plan}, speed=1.0, tolerance=0.01, period_s=0.01)
 
 
-def test_a_position_limit_is_kept_within_the_tolerance() -> None:
+def test_a_position_limit_is_kept_within_the_tolerance():
     """A servo that was measured a little beyond its limit is sent no farther than that."""
     wave = np.sin(np.linspace(0, 6, 200))
     assert np.abs(rows(1.009 * wave).positions).max() == 1.0
@@ -240,7 +177,7 @@ def test_a_position_limit_is_kept_within_the_tolerance() -> None:
     )
 
 
-def test_speed_and_acceleration_limits_hold_where_they_are_reached() -> None:
+def test_speed_and_acceleration_limits_hold_where_they_are_reached():
     wave = 0.5 * np.sin(np.linspace(0, 8, 400))  # of 2 s: 2 rad/s, 8 rad/s^2
     assert rows(wave, velocity=2.2, acceleration=11.0).duration_s == pytest.approx(2.3, abs=0.02)
     with pytest.raises(InputError, match=r"rad/s, more than its 1.7 rad/s") as found:
@@ -251,7 +188,7 @@ def test_speed_and_acceleration_limits_hold_where_they_are_reached() -> None:
 
 
 @pytest.mark.parametrize("seconds", [0.01, 0.02, 0.04, 0.1])
-def test_a_jump_is_refused_however_short_the_motion_is(seconds: float) -> None:
+def test_a_jump_is_refused_however_short_the_motion_is(seconds):
     with pytest.raises(InputError, match=r"pan moves at .* rad/s, more than its 5 rad/s") as found:
         rows(np.array([-0.5, -0.5, 0.5, 0.5]), seconds, acceleration=100.0)
     assert "at speed" not in str(found.value)
@@ -259,7 +196,7 @@ def test_a_jump_is_refused_however_short_the_motion_is(seconds: float) -> None:
     assert rows(np.array([-0.01, 0.01]), seconds).duration_s == pytest.approx(2 * seconds, abs=0.011)
 
 
-def test_a_long_motion_has_fewer_rows_and_one_that_is_too_long_is_refused() -> None:
+def test_a_long_motion_has_fewer_rows_and_one_that_is_too_long_is_refused():
     still = np.zeros(2000)
     assert rows(still, 8000.0).period_s == pytest.approx(0.02)
     with pytest.raises(InputError, match="11000 s of 1 joints are too long to play at once, at most 10000 s"):
@@ -269,7 +206,7 @@ def test_a_long_motion_has_fewer_rows_and_one_that_is_too_long_is_refused() -> N
 # Sources
 
 
-def test_a_state_that_is_not_valid_is_no_position(swing: Path, tmp_path: Path) -> None:
+def test_a_state_that_is_not_valid_is_no_position(swing, tmp_path):
     """A position beside a lost reply is the one before it; a loss of more than 1 s is no motion."""
     pan, tilt = (read_log(swing).joints.index(joint) for joint in ("pan", "tilt"))
     lost = (put("valid", (slice(50, 81), pan), False), put("valid", (slice(120, 251), tilt), False))
@@ -283,7 +220,7 @@ def test_a_state_that_is_not_valid_is_no_position(swing: Path, tmp_path: Path) -
         read_motion(tmp_path / "lost.mcap", what="states")
 
 
-def test_way_to_a_goal_with_a_speed_is_played(swing: Path, tmp_path: Path) -> None:
+def test_way_to_a_goal_with_a_speed_is_played(swing, tmp_path):
     pan = read_log(swing).joints.index("pan")
     log = write_changed(swing, tmp_path / "fast.mcap", put("command_velocity", (slice(None), pan), 3.0))
     assert read_motion(log).what == ("states", "goals")
@@ -292,9 +229,7 @@ def test_way_to_a_goal_with_a_speed_is_played(swing: Path, tmp_path: Path) -> No
 # Ended early
 
 
-def test_ctrl_c_brings_the_joints_to_rest_and_ends_the_run(
-    swing: Path, place: Path, dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_ctrl_c_brings_the_joints_to_rest_and_ends_the_run(swing, place, dxlrun, monkeypatch):
     def interrupt(*_: object) -> None:
         threading.Timer(0.67, os.kill, (os.getpid(), signal.SIGINT)).start()
 
@@ -306,3 +241,78 @@ def test_ctrl_c_brings_the_joints_to_rest_and_ends_the_run(
     log = read_log(path)
     assert log.complete
     assert np.abs(np.diff(log.cycles["goal_position"][-10:], axis=0)).max() < 1e-3
+
+
+@pytest.mark.parametrize(("degrees", "most_points"), [(0.02, 120), (2.0, 16)])
+def test_what_it_plays_is_within_the_tolerance(swing, place, dxlrun, degrees, most_points):
+    words = ["--tolerance", f"{degrees}deg", "--json"]
+    result = result_of(dxlrun("convert", swing, "again.yaml", *words).out)
+    assert result["points"].keys() == {"both"}
+    assert 5 < result["points"]["both"] <= most_points
+    assert dxlrun("pair.yaml", "--virtual", "--play", "again.yaml").code == 0
+    (path,) = place.glob("logs/*.mcap")
+    for joint in ("pan", "tilt"):
+        time_s, sent = goals(read_log(swing), joint)
+        again_s, again = goals(read_log(path), joint)
+        # from 1 s on, one second after the file's start
+        off = np.abs(np.interp(time_s + 1.0, again_s, again) - sent)
+        assert off.max() <= np.radians(degrees) * 1.05, joint
+
+
+def test_the_file_says_where_it_comes_from_and_is_never_written_over(swing, place, dxlrun):
+    done = dxlrun("convert", swing, "2nd-try.yaml", "--from", "1.5", "--to", "2")
+    assert re.fullmatch(
+        rf"2nd-try.yaml: 0.5 s of {swing}, with a deviation of at most 0.1 deg: \d+ points for both\n",
+        done.out,
+    )
+    text = (place / "2nd-try.yaml").read_text()
+    assert text.startswith(
+        f"# Motion of {swing}, 1.500 s to 2.000 s: goals of pan, tilt, with a deviation of at most 0.1 deg.\n"
+        "# Written by `dxlrun convert`.\nname: motion_2nd_try\n"
+    )
+    again = dxlrun("convert", swing, "2nd-try.yaml")
+    assert (again.code, (place / "2nd-try.yaml").read_text()) == (2, text)
+    assert again.err == "dxlrun: 2nd-try.yaml cannot be written (it exists); choose another name\n"
+    assert [each.name for each in place.iterdir() if "2nd" in each.name] == ["2nd-try.yaml"]
+
+
+def test_controllers_of_single_positions_get_them_every_20_ms(tmp_path):
+    """A joint that becomes slow at the end gets a speed at which it still arrives."""
+    time, zero = np.linspace(0.0, 2.0, 101), np.zeros(101)
+    position = np.stack([1.5 * np.sin(time * np.pi / 4), zero, 0.3 * np.sin(time), zero], axis=1)
+    joints = ("pan", "wheel", "tilt", "neck")
+    motion = RecordedMotion(Path("log"), joints, ("states",) * 4, time, position, 0.0, (ROTARY,) * 4)
+    head = ControllerPlan(
+        name="head",
+        type="joint_group_posvel_controller",
+        distribution="",
+        parameters="",
+        joints=("pan", "wheel"),
+        command=("position", "velocity"),
+        publishes=(),
+        active=True,
+        every=1,
+    )
+    group = "joint_group_position_controller"
+    tail = structs.replace(head, name="tail", type=group, joints=("tilt",), command=("position",))
+    rests = structs.replace(tail, name="rests", joints=("neck",))
+    speeds = dict.fromkeys(joints, math.inf) | {"wheel": 0.2}
+    allowed, file, plans = np.full(4, math.radians(0.5)), tmp_path / "slow.yaml", [head, tail, rests]
+    file.write_text(motion_file(motion, allowed, file, None, "", plans=plans, speeds=speeds).text)
+    parts = {part.controller: part.points for part in read_motion_file(file).motion.motions}
+    assert [point.time for point in parts.pop("rests")] == [1_000_000_000, 3_000_000_000]
+    for points in parts.values():
+        assert points[0].time == 1_000_000_000
+        assert np.diff([point.time for point in points]).min() == pytest.approx(20_000_000, abs=1_000_000)
+    assert {target.velocity for point in parts["tail"] for target in point.joints.values()} == {None}
+    assert parts["head"][1].joints["pan"].velocity == pytest.approx(1.5 * np.pi / 4, rel=0.02)
+    last = parts["head"][-1].joints
+    assert (last["pan"].velocity, last["wheel"].velocity) == pytest.approx((0.5, 0.2))
+
+
+def test_another_controller_and_other_joints(swing, place, dxlrun):
+    words = ["--joint", "pan", "--map", "pan=elbow", "--controller", "arm"]
+    assert dxlrun("convert", swing, "a.yaml", *words).code == 0
+    (part,) = read_motion_file(place / "a.yaml").motion.motions
+    assert part.controller == "arm"
+    assert set(part.points[0].joints) == {"elbow"}  # type: ignore[union-attr]  # of points
