@@ -38,7 +38,7 @@ RUN = "dxlrun robots/bioloid_torso.yaml --play robots/motions/three_parts.yaml"
 TESTS = (
     "tests/run/channels tests/sensors/test_readings.py tests/compile/test_{cases,limits}.py "
     "tests/dxlwire/test_{protocols,bus}.py "
-    "tests/dynamixel/test_{kernel,kernel_rules,goals,samples}.py "
+    "tests/dynamixel/test_{kernel,idle}.py "
     "tests/control/test_{gate,loop,manager}.py "
     "tests/log/test_{messages,log,recorder}.py"
 )

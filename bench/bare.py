@@ -19,7 +19,7 @@ import sys
 import tarfile
 from pathlib import Path
 
-TESTS = ("tests/description", "tests/dxlwire/control_table", "tests/dynamixel/test_kernel_rules.py")
+TESTS = ("tests/description", "tests/dxlwire/control_table", "tests/dynamixel/test_kernel.py::TestKernel")
 INSIDE = """
 set -eu
 cd /trial

@@ -1,13 +1,23 @@
+"""Idle time, samples and reports of one bus, and servos that answer with checksummed nonsense."""
+
+import numpy as np
 import pytest
-from tests.kit.rigs import make_rig, make_x
+from msgspec.structs import replace
+from tests.kit.campaigns import campaign
+from tests.kit.rigs import Events, make_plan, make_rig, make_x, start_rig
 
 from dxlrun.channels.event_records import EventCode
 from dxlrun.dynamixel.wire_reports import WireReports
 from dxlwire.exchange.idle import STARVED, STARVED_AGAIN, IdleScheduler, Urgency
+from dxlwire.exchange.reports import Reason
+from dxlwire.exchange.samples import REPORT_AGAIN_NS
+from dxlwire.modes import Mode
 from dxlwire.plan.line import listen_transaction
+from dxlwire.plan.mode_plan import in_mode
 from dxlwire.plan.planning import plan_line
 from dxlwire.transaction import TransactionOutcome
 from dxlwire.wire import protocol2
+from dxlwire.wire.dialect import dialect_of
 
 READ_NS = 270_000
 """14 bytes there, 13 back, 1 Mbit/s, no return delay: what one of the reads below takes."""
@@ -177,3 +187,248 @@ def test_one_reply_that_came_a_second_late_does_not_close_the_idle_time_of_the_n
     rounds.add(reading(rounds, 11, 7), found.append, Urgency.MODE, "the mode of a servo")
     assert len(rounds.gap(5_000_000)) == 1
     assert found == [[11]]
+
+
+MS = 1_000_000
+SECOND_NS = 1_000_000_000
+
+
+class Robot:
+    """Servos that say what a test puts into their replies."""
+
+    def __init__(self, *plans):
+        self.rig = make_rig(*plans)
+        self.plans, self.events, self.states = plans, self.rig.events, self.rig.states
+        self.servos = [servo for plan in plans for servo in plan.servos]
+        self.samples = self.rig.hardware._samples
+        self.replies = [bytearray(servo.state.length) for servo in self.servos]
+        self.now_ns = SECOND_NS
+
+    def put(self, index, position, velocity, effort):
+        """Put raw values into the bytes of a servo, as its control table has them."""
+        layout, reply = self.servos[index].state, self.replies[index]
+        for place, value in (
+            (layout.position, position),
+            (layout.velocity, velocity),
+            (layout.effort, effort),
+        ):
+            signed = place.encoding == "twos_complement"
+            data = value.to_bytes(place.size, "little", signed=signed)
+            reply[place.offset : place.offset + place.size] = data
+
+    def settle(self, fresh, arrived_ns, *, after_ns=10 * MS):
+        """Let the replies arrive so long before now, of those that are fresh."""
+        self.now_ns += after_ns
+        self.samples.follow_modes()
+        self.samples.fresh[:] = False
+        said = iter(zip(fresh, self.replies, arrived_ns, strict=True))
+        for bus, plan in zip(self.samples.buses, self.plans, strict=True):
+            for index in range(len(plan.servos)):
+                came, reply, age_ns = next(said)
+                if came:
+                    bus.store_state(index, bytes(reply), self.now_ns - age_ns)
+        self.samples.fill_states(self.now_ns)
+
+    def all_said(self, *raw, age_ns=0):
+        """Let every servo say the same."""
+        for index in range(len(self.servos)):
+            self.put(index, *raw)
+        count = len(self.servos)
+        self.settle([True] * count, [age_ns] * count)
+
+    def turn(self, *positions, after_ms=10, came=True):
+        """Let the servos stand at angles, rad; return which are valid, and where."""
+        for index, (servo, angle) in enumerate(zip(self.servos, positions, strict=True)):
+            raw = round((angle * servo.direction + servo.reference) / servo.rad_per_tick)
+            self.put(index, raw, 0, 0)
+        fresh = [True] * (len(positions) - 1) + [came]
+        self.settle(fresh, [0] * len(positions), after_ns=after_ms * MS)
+        return self.states.valid.tolist(), self.states.position.tolist()
+
+
+def test_signs_follow_the_joints_direction():
+    robot = Robot(make_plan())
+    robot.all_said(512, 100, 1024 + 200, age_ns=30)  # counter-clockwise 100; clockwise 200
+    servo = robot.servos[0]
+    direction = np.array([one.direction for one in robot.servos])
+    assert robot.states.position == pytest.approx([one.joint_position(512) for one in robot.servos])
+    assert robot.states.velocity == pytest.approx(direction * 100 * servo.rad_s_per_tick)
+    assert robot.states.effort == pytest.approx(direction * -200 / 1023)
+    assert robot.states.age_ns.tolist() == [30] * 8
+
+
+def test_a_lost_row_keeps_its_own_values_and_ages():
+    robot = Robot(make_plan())
+    states = robot.states
+    for index in range(8):
+        robot.put(index, 100 + index, 0, 0)
+    robot.settle(np.arange(8) != 3, [0] * 8)
+    assert np.isnan(states.position[3])
+    assert states.age_ns[3] == -1
+    robot.settle([True] * 8, [0] * 8)
+    kept = states.position.copy()
+    for index in range(8):
+        robot.put(index, 90, 0, 0)
+    robot.settle(np.arange(8) != 5, [0] * 8)
+    assert states.position[5] == kept[5]
+    assert not states.valid[5]
+    assert states.age_ns[5] == 10 * MS
+    assert (states.position != kept).sum() == 7
+
+
+class TestJumps:
+    """Positions that no servo can reach."""
+
+    @pytest.fixture
+    def robot(self):
+        return Robot(make_plan((1, 3)))
+
+    def test_a_fast_servo_is_believed(self, robot):
+        for step in range(20):
+            assert robot.turn(step * 0.11, -step * 0.11)[0] == [True, True]  # 11 rad/s
+
+    def test_a_jump_is_invalid_and_the_row_keeps_its_value_until_it_can_be_true(self, robot):
+        before = robot.turn(0.0, 0.0)[1]
+        assert robot.turn(0.0, 1.5) == ([True, False], before)
+        seen = [robot.turn(0.0, 1.5)[0][1] for _ in range(20)]
+        assert seen.index(True) in range(8, 14)  # 1.5 rad at 11.9 rad/s
+        assert all(seen[seen.index(True) :])
+        ((source, text),) = robot.events.of(EventCode.IMPLAUSIBLE)
+        assert source == "main_3_joint"
+        assert "jumped by 86 deg in 10 ms" in text
+        assert REPORT_AGAIN_NS == SECOND_NS
+
+    def test_who_was_not_seen_for_long_may_be_elsewhere(self, robot):
+        robot.turn(0.0, 0.0)
+        assert robot.turn(2.0, 0.0, after_ms=500)[0] == [True, True]
+
+    def test_a_servo_with_a_profile_is_no_faster_than_its_velocity_limit_can_be(self):
+        robot = Robot(make_plan((1, 3), model="XM430-W350", protocol=2.0))
+        before = robot.turn(0.0, 0.0)[1]
+        assert robot.turn(0.0, 1.5) == ([True, False], before)
+
+    def test_a_joint_over_many_turns_jumps_only_after_a_reboot(self):
+        robot = Robot(make_x((1, 3), continuous=True, lower=-np.inf, upper=np.inf))
+        robot.turn(40.0, 40.0)
+        assert robot.turn(0.0, 40.0)[0] == [False, True]
+        robot.samples.buses[0].restart_count(0)
+        assert robot.turn(0.0, 40.0)[0] == [True, True]
+
+    def test_a_row_looks_no_younger_for_a_reply_that_was_not_believed(self, robot):
+        robot.turn(0.0, 0.0)
+        robot.turn(0.0, 1.5)
+        robot.turn(0.0, 0.0, came=False)
+        assert not robot.states.valid[1]
+        assert robot.states.age_ns.tolist() == [0, 20 * MS]
+
+
+@pytest.mark.parametrize("reason", Reason)
+def test_each_reason_of_the_wire_is_an_event(reason: Reason) -> None:
+    events = Events()
+    WireReports(events).report(reason, "main", "a sentence")
+    ((_, _, source, text),) = events.list
+    assert (source, text) == ("main", "a sentence")
+
+
+ROBOTS = {
+    "x": ("XM430-W350", 2.0, {}, "position_p_gain", (1, 2, 3, 4, 5)),
+    "x_fast": ("XM430-W350", 2.0, {"fast": True}, "velocity_i_gain", (1, 2, 3, 4, 5)),
+    "mx": ("MX-64", 1.0, {}, "p_gain", (1, 2, 3)),
+    "ax": ("AX-12A", 1.0, {}, "cw_compliance_slope", (1, 2, 4)),
+}
+SLOW = ("present_temperature", "present_voltage", "present_input_voltage")
+SYNC_WRITE = 0x83
+
+
+class Liars:
+    """Lets servos answer with other packets than their own, every checksum right."""
+
+    def __init__(self, rig, chance):
+        self._rig = rig
+        self._chance = chance
+        self._dialect = dialect_of(rig.plans[0].protocol)
+        self._write = rig.ports.ports[0].write_packet
+        self._often = chance.choice((0.1, 0.2, 0.4))
+        rig.ports.ports[0].write_packet = self.write
+
+    def write(self, data):
+        packet, chance = bytes(data), self._chance
+        two = self._dialect.PROTOCOL == 2.0
+        instruction, servo_id = (packet[7], packet[4]) if two else (packet[4], packet[2])
+        if instruction != SYNC_WRITE and chance.random() < self._often:
+            liar = chance.choice((1, 2, 3)) if servo_id == 254 else servo_id
+            self._rig.buses[0].alter_next(liar, "a lie", self._lie)
+        self._write(data)
+
+    def _lie(self, reply):
+        """Return another ID, error or length, or other data; sometimes two packets."""
+        chance, packets = self._chance, b""
+        for _ in range(chance.choice((1, 1, 2))):
+            length = max(0, len(reply) - self._dialect.OVERHEAD + chance.choice((0, 0, 0, 1, -1, 40, -40)))
+            data = bytes(chance.choice((0, 1, 0xFD, 0xFF, chance.randrange(256))) for _ in range(length))
+            servo_id = chance.choice((1, 2, 3, 0, 0xFD, 0xFE))
+            error = chance.choice((0, 0, 0x80, 0xFF, chance.randrange(256)))
+            packets += self._dialect.status_packet(servo_id, error, data)
+        return packets
+
+    def end(self):
+        self._rig.ports.ports[0].write_packet = self._write
+
+
+def robot(name):
+    model, protocol, change, *_ = ROBOTS[name]
+    middle = {} if model == "AX-12A" else {"reference": np.pi}
+    plan = make_plan((1, 2, 3), model=model, protocol=protocol, return_delay_ns=0, **middle, **change)
+    servos = tuple(replace(servo, torque_on_return=True, slow=SLOW) for servo in plan.servos)
+    ticks = 10 if protocol == 2.0 else 0
+    return start_rig(replace(plan, servos=servos, slow_period_ns=300_000_000, watchdog_ticks=ticks))
+
+
+def act(rig, chance, name):
+    """Wish for a mode or a register now and then."""
+    *_, item, modes = ROBOTS[name]
+    if chance.random() < 0.1:
+        wanted = np.zeros(3, np.uint8)
+        wanted[chance.randrange(3)] = chance.choice(modes)
+        rig.hardware.set_modes(wanted)
+    if chance.random() < 0.1:
+        value = chance.choice((8, 16, 32))
+        rig.hardware.write_register(chance.randrange(3), item, value, lambda *_: None)
+
+
+def cycle(rig):
+    """Run one cycle with goals of nothing: every joint stands."""
+    for array in rig.goals.values:
+        array[rig.states.mode == Mode.UNKNOWN] = np.nan
+    for mode, array in ((2, rig.goals.velocity), (3, rig.goals.effort), (4, rig.goals.pwm)):
+        array[rig.states.mode == mode] = 0.0
+    start = rig.clock.now_ns()
+    rig.hardware.read_states()
+    rig.hardware.write_goals()
+    rig.hardware.idle(start + rig.period_ns)
+    rig.clock.wait_until(max(start + rig.period_ns, rig.clock.now_ns()))
+
+
+@campaign(ci=1, night=40, release=200)
+@pytest.mark.parametrize("name", ROBOTS)
+def test_wrong_replies_raise_nothing_and_modes_and_torque_are_known_soon_after(name, number, chance):
+    rig = robot(name)
+    liars = Liars(rig, chance)
+    for _ in range(150):
+        act(rig, chance, name)
+        cycle(rig)
+    liars.end()
+    for _ in range(200):  # a lost servo is probed once a second, and waits for the replies that it owes
+        cycle(rig)
+    torqued = rig.hardware._servos[0].life.torqued
+    for servo in rig.plans[0].servos:
+        registers, row = rig.servo(servo.servo_id).registers, servo.row
+        mode = Mode(int(rig.states.mode[row]))
+        if not rig.states.valid[row]:
+            continue
+        found = {value.name: registers[value.name] for each in servo.modes for value in each.operating}
+        if mode is not Mode.UNKNOWN:
+            assert in_mode(servo.mode_plan(mode), found), (servo.joint, mode, found)
+        if torqued[row]:
+            assert registers["torque_enable"] == 1, f"{servo.joint} gets goals without torque"
+    assert rig.states.valid.all(), "\n".join(f"{e[3]}" for e in rig.events.list[-30:])

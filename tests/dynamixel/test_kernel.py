@@ -1,5 +1,8 @@
-"""The compiled kernel does what the parser does, whatever arrives; and what it promises on its own."""
+"""The compiled kernel does what the parser does, whatever arrives; goals by the rules of one servo."""
 
+from __future__ import annotations
+
+import math
 import os
 import re
 import shutil
@@ -11,23 +14,29 @@ from threading import Thread, Timer
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from tests.kit.awaited import until
 from tests.kit.campaigns import campaign
+from tests.kit.exchanges import AT_NS, GOOD, Host, SpoiltReplies, every
 from tests.kit.loaded import loaded
 from tests.kit.rigs import make_plan, make_rig, start_rig
 
 import fuzz_kernel as fuzz
 from dxlrun.channels.cycle import Commands, States
 from dxlrun.dynamixel.dynamixel_hardware import DynamixelHardware, ServoArrays
+from dxlrun.dynamixel.servo.life import ServoEvent
+from dxlrun.errors import PortError
 from dxlwire.clock import MonotonicClock
 from dxlwire.exceptions import NotCompiled
 from dxlwire.exchange import bus_engine, kernel
 from dxlwire.exchange.bus_engine import FREE_NS, Lines
 from dxlwire.exchange.cyclic_reads import CALM_CYCLES
+from dxlwire.modes import Mode
 from dxlwire.packets import RECORD_HEADER, PacketKind
 from dxlwire.port import ports
 from dxlwire.port.ports import SerialPort, SerialPorts
-from dxlwire.wire import protocol2
+from dxlwire.wire import protocol1, protocol2
 
 ROOT = Path(__file__).parents[2]
 STEADY = b"\0\2" + bytes(8)
@@ -348,3 +357,282 @@ def test_a_build_without_any_compiler_fails_and_names_the_fix(build, tmp_path, m
     hook = build.KernelHook(str(tmp_path), {}, None, None, "", "wheel")
     with pytest.raises(RuntimeError, match=r"install a C compiler \(sudo apt install gcc\)"):
         hook.initialize("standard", {})
+
+
+class ParserHost(Host):
+    """Four servos that the parser alone reads."""
+
+    by_parser = True
+
+    def __init__(self, way):
+        plans, self.dialect = fuzz.robot(way, 1)
+        self.side = fuzz.Side(plans, by_parser=self.by_parser)
+        self.goals = np.full_like(self.side.goals.values, np.nan)
+        (self.bus,) = self.side.hardware._buses
+        self.byte_ns = self.bus.byte_ns
+
+    def reads(self):
+        return self.side.prepare()[0]
+
+    def exchange(self, given):
+        self.ended = self.side.ended
+        self.side.cycle([given], self.goals)
+        return self.side.states.valid.tolist()
+
+    @property
+    def log(self):
+        return [(one.kind, one.data, one.last_ns) for one in self.side.log]
+
+    @property
+    def errors(self):
+        return self.side.hardware._servos[0].reads.errors
+
+    @property
+    def noise_bytes(self):
+        return self.bus.noise_bytes
+
+
+class KernelHost(ParserHost):
+    """Four servos that the kernel reads."""
+
+    by_parser = False
+
+    def check_reader(self, by_kernel):
+        assert (self.side.ended > self.ended) == by_kernel
+
+
+class TestParser(SpoiltReplies):
+    host = ParserHost
+
+
+class TestKernel(SpoiltReplies):
+    host = KernelHost
+
+    @every
+    def test_a_line_that_is_ready_without_a_byte_is_waited_for(self, line, monkeypatch):
+        wait, calls = line.side.lines.wait_for_bytes, []
+
+        def ready(deadline_ns):
+            calls.append(deadline_ns)
+            return [0] if len(calls) == 2 else wait(deadline_ns)
+
+        monkeypatch.setattr(line.side.lines, "wait_for_bytes", ready)
+        assert line.cycle(by_kernel=True) == GOOD
+        assert len(calls) > 2
+
+    @every
+    def test_a_line_that_is_gone_is_left_to_the_parser_at_once(self, line, monkeypatch):
+        looks = []
+
+        def gone(buffer):
+            looks.append(len(buffer))
+            raise PortError("it is gone")
+
+        monkeypatch.setattr(line.side.lines.ports[0], "read_into", gone)
+        assert line.cycle(by_kernel=False) == [False] * 4
+        assert str(line.bus.failure) == "it is gone"
+        assert len(looks) == 2  # the kernel's, and the parser's, which has the reason
+
+    @every
+    def test_reply_is_awaited_from_when_the_host_had_sent_its_request(self, line):
+        line.side.lines.ports[0].stall_ns = 50_000_000  # longer than any reply is awaited
+
+        def pieces(packets):
+            return [(50_000_000 + AT_NS, b"".join(packets))]
+
+        assert line.cycle(pieces=pieces, by_kernel=True) == GOOD
+
+    @every
+    def test_reply_that_came_while_the_host_stood_still_is_taken(self, line, monkeypatch):
+        wait = line.side.lines.wait_for_bytes
+
+        def late(deadline_ns):
+            if deadline_ns:
+                line.side.lines.clock.wait_until(deadline_ns + 30_000_000)
+                return []
+            return wait(0)
+
+        monkeypatch.setattr(line.side.lines, "wait_for_bytes", late)
+        assert line.cycle(by_kernel=True) == GOOD
+
+
+REPEATED = 50
+LEADS = {Mode.VELOCITY: 1, Mode.EFFORT: 2, Mode.PWM: 3}
+ODD = st.sampled_from([np.nan, np.inf, -np.inf, 1e300, -1e300, 5e-324, 0.0, -0.0]) | st.floats(-10, 10)
+DIALECTS = {1.0: protocol1, 2.0: protocol2}
+
+
+class Writer:
+    """The kernel, as it writes the goals of one bus."""
+
+    def __init__(self, plan):
+        self.plan, self.side = plan, fuzz.Side([plan])
+        (self.servos,) = self.side.hardware._servos
+        self.goals = self.side.goals
+
+    def include(self, servos):
+        for index, torqued in enumerate(self.servos.life.torqued.tolist()):
+            if torqued != (index in servos):
+                self.servos.life.on(index, ServoEvent.DOUBT if torqued else ServoEvent.TORQUE_ON)
+
+    def write(self):
+        """Send what is due; return the packets."""
+        (line,) = self.side.lines.ports
+        line.sent = []
+        self.side.hardware.write_goals()
+        return line.sent
+
+    def sent(self):
+        """Send what is due; return each servo's bytes of each packet, by ID."""
+        return [records(packet, self.plan.protocol) for packet in self.write()]
+
+
+def records(packet, protocol):
+    """Take a sync write apart by ID; it must be as the dialect would have written it."""
+    dialect = DIALECTS[protocol]
+    size = 1 if protocol == 1.0 else 2
+    body = packet[5:-1] if protocol == 1.0 else protocol2.unstuffed(packet[7:-2])[1:]
+    address, length = (int.from_bytes(body[at : at + size], "little") for at in (0, size))
+    body = body[2 * size :]
+    assert len(body) % (length + 1) == 0
+    found = {body[at]: body[at + 1 : at + 1 + length] for at in range(0, len(body), length + 1)}
+    assert packet == dialect.sync_write(address, length, found)
+    return found
+
+
+def tick(cell, goal, ceiling):
+    """Return the integer of a goal, as `GoalCell` says."""
+    if cell.magnitude:
+        if cell.interface == 1 and not (math.isnan(ceiling) or abs(goal) <= ceiling):
+            goal = ceiling
+        exact = abs(goal) / cell.unit
+        if cell.low <= exact <= cell.high:
+            return math.floor(exact + 1e-6) if cell.interface == 1 else round(exact)
+        return cell.low if exact < cell.low else cell.high if exact > cell.high else cell.free
+    exact = (cell.sign * goal + cell.offset) / cell.unit
+    found = round(exact) if cell.low <= exact <= cell.high else cell.low if exact < cell.low else cell.high
+    return 0x400 - found if cell.place.encoding == "sign_magnitude" and found < 0 else found
+
+
+def block(cells, length, goals, row, ceiling):
+    """Return a servo's bytes in a sync write."""
+    found = bytearray(length)
+    for cell in cells:
+        at, size = cell.place.offset, cell.place.size
+        value = tick(cell, goals[cell.interface][row], ceiling) & ((1 << 8 * size) - 1)
+        found[at : at + size] = value.to_bytes(size, "little")
+    return bytes(found)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    moves=st.lists(
+        st.tuples(st.sets(st.integers(0, 7)), st.sets(st.integers(0, 7)), st.integers(1, 60)), max_size=6
+    )
+)
+def test_a_goal_is_sent_when_it_changed_once_more_and_every_so_many_cycles(moves):
+    writer = Writer(make_plan())
+    goals, servos = writer.goals, writer.plan.servos
+    goals.velocity[:] = goals.effort[:] = goals.pwm[:] = np.nan
+    goals.position[:] = 0.1
+    last, asked, chosen, cycle = [0] * 8, [2] * 8, set(range(8)), 0
+    for moved, without, cycles in [(set(), set(), 3), *moves]:
+        for servo in moved:
+            goals.position[servo] += 0.05 if goals.position[servo] < 0.5 else -0.9
+        now = set(range(8)) - without
+        for servo in moved | (now - chosen):
+            asked[servo] = 2
+        chosen = now
+        writer.include(chosen)
+        for _ in range(cycles):
+            cycle += 1
+            wanted = {s for s in chosen if asked[s] or cycle - last[s] >= REPEATED}
+            asked = [max(0, count - 1) for count in asked]
+            for servo in wanted:
+                last[servo] = cycle
+            found = writer.sent()
+            assert [set(one) for one in found] == ([{servos[s].servo_id for s in wanted}] if wanted else [])
+
+
+KINDS = [("AX-12A", 1.0), ("MX-64", 1.0), ("XM430-W350", 2.0), ("XL-320", 2.0)]
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=str)
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_a_servo_with_torque_and_a_goal_in_its_mode_gets_that_and_no_other_does(kind, data):
+    model, protocol = kind
+    writer = Writer(make_plan((1, 2, 3), model=model, protocol=protocol))
+    servos = writer.plan.servos
+    modes = [
+        data.draw(st.sampled_from([one.mode for one in servo.modes] + [Mode.UNKNOWN])) for servo in servos
+    ]
+    torqued = data.draw(st.sets(st.integers(0, 2)))
+    writer.include(torqued)
+    ceiling = data.draw(st.lists(st.just(np.nan) | ODD.map(abs), min_size=3, max_size=3))
+    writer.goals.values[:] = data.draw(
+        st.lists(st.lists(ODD, min_size=3, max_size=3), min_size=4, max_size=4)
+    )
+    writer.servos.life.ceiling[:] = ceiling
+    for index, mode in enumerate(modes):
+        writer.servos.goals.set_mode(index, mode)
+    values = writer.goals.values.tolist()
+    expected = []
+    for one in writer.servos.goals.sync_writes:
+        rows = [
+            at
+            for at, row in enumerate(one.rows)
+            if one.members[at] in torqued and not math.isnan(values[one.lead][row])
+        ]
+        expected.append(
+            {
+                one.ids[at]: block(
+                    one.cells[at], one.layout.length, values, one.rows[at], ceiling[one.members[at]]
+                )
+                for at in rows
+            }
+        )
+    assert writer.sent() == [one for one in expected if one]
+    assert {servo_id for one in expected for servo_id in one} == {
+        servo.servo_id
+        for index, (servo, mode) in enumerate(zip(servos, modes, strict=True))
+        if index in torqued
+        and mode is not Mode.UNKNOWN
+        and not math.isnan(values[LEADS.get(mode, 0)][servo.row])
+    }
+
+
+@pytest.mark.parametrize("dialect", [protocol1, protocol2], ids=["protocol 1", "protocol 2"])
+def test_goals_are_stuffed_and_sealed_as_the_e_manual_says(dialect):
+    ids, model = range(1, 41), "AX-12A" if dialect is protocol1 else "XM430-W350"
+    change = {"model": model, "protocol": dialect.PROTOCOL, "reference": 0.0}
+    ticks = [100 + servo_id for servo_id in ids]
+    if dialect is protocol2:  # in which 40 servos have a length of two bytes
+        change |= {"continuous": True, "lower": -1000.0, "upper": 1000.0}
+        # FF FF FD FF, and what is nearly so: FF 00 FD, FF FF 00, 00 FF FD
+        ticks[:4] = [-131073, -196353, 65535, -131328]
+    writer = Writer(make_plan(ids, **change))
+    for index, servo in enumerate(writer.plan.servos):
+        writer.servos.goals.set_mode(index, Mode.POSITION)
+        writer.goals.position[index] = servo.direction * ticks[index] * servo.rad_per_tick
+    (packet,) = writer.write()
+    place = writer.plan.servos[0].mode_plan(Mode.POSITION).goals[0].position
+    found = records(packet, dialect.PROTOCOL)
+    raw = [found[one][place.offset : place.offset + place.size] for one in ids]
+    assert [int.from_bytes(one, "little", signed=place.size > 2) for one in raw] == ticks
+    assert dialect is protocol1 or b"\xff\xff\xfd\xfd\xff" in packet
+
+
+@pytest.mark.parametrize(
+    "case", [("AX-12A", 1.0, [50, 20]), ("XM430-W350", 2.0, [113, 37])], ids=["protocol 1", "protocol 2"]
+)
+def test_goals_beyond_one_sync_write_are_split_and_logged(case):
+    model, protocol, counts = case
+    plan = make_plan(range(sum(counts)), model=model, protocol=protocol)
+    side = fuzz.Side([plan], memoryview(bytearray(2064)))  # a batch of the log that holds but one of them
+    side.goals.values[:] = 0.0
+    side.hardware.write_goals()
+    (line,) = side.lines.ports
+    side.packets.commit_packets()
+    assert [packet.data for packet in side.log] == line.sent
+    assert [len(records(packet, protocol)) for packet in line.sent] == counts

@@ -1,15 +1,40 @@
-"""What the guardian does when the loop died: servos become limp, or wheels stand."""
+"""What the guardian does when the loop died, owed replies, and late, doubled and lost ones in pairs."""
 
+from __future__ import annotations
+
+import itertools
 import math
+import random
+import re
 import subprocess
 import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 
 import pytest
-from tests.kit.line_faults import delay_next, truncate_next
-from tests.kit.rigs import every_servo, make_plan, start_rig
+from tests.kit.campaigns import campaign
+from tests.kit.line_faults import STALLED, delay_next, disturb_replies, truncate_next
+from tests.kit.rigs import Rig, VirtualLine, every_servo, make_plan, make_rig, make_x, start_rig
 
+from dxlrun.dynamixel.servo.item_access import access_servo
 from dxlrun.dynamixel.servo.torque_off import LATE_NS, LONGER_NS, limp, stand
+from dxlrun.dynamixel.tools.inspection import compare_servos, identify, inspect_buses
+from dxlrun.dynamixel.tools.one_servo import OneServo
+from dxlrun.dynamixel.tools.scanning import Search, find_servo, scan
+from dxlrun.dynamixel.tools.tool_line import ToolLine
+from dxlrun.errors import ServoFault, StartUpError
+from dxlrun_hand.servo_setup import bring
+from dxlsim.bus.simulated_bus import PacketFault, SimulatedBus
+from dxlsim.simulation_plan import ServoConfig
+from dxlwire.bus_plan import BusPlan
+from dxlwire.control_table import find_table
+from dxlwire.exchange.bus_engine import Lines
+from dxlwire.exchange.owed import LEAST_WINDOW_NS, SLOW_MEMORY_NS, OwedReplies
+from dxlwire.plan.line import MOST_SPARE
+from dxlwire.plan.planning import Wiring, bus_plan
+from dxlwire.plan.retry import ReplyLateness, extend_timeouts, retry
+from dxlwire.transaction import Program, Reply, Transaction
+from dxlwire.wire import protocol2
 
 
 @pytest.fixture
@@ -78,15 +103,6 @@ def test_silent_servos_are_named_and_time_is_bounded(rig):
     assert rig.torque()[4:] == [False] * 4
 
 
-def test_a_line_that_is_gone_does_not_keep_the_other_one():
-    rig = start_rig(make_plan((1, 2), name="left"), make_plan((1, 7), name="right", first_row=2))
-    rig.ports.ports[0].unplug()
-    outcomes = limp(rig.lines)
-    assert [one.confirmed for one in outcomes] == [False, False, True, True]
-    assert "could not be sent" in outcomes[0].detail
-    assert rig.torque(1) == [False, False]
-
-
 def test_a_babbling_line_does_not_hold_it_up(rig):
     start = rig.clock.now_ns()
     for step in range(400):
@@ -151,12 +167,6 @@ def test_a_wheel_that_keeps_its_torque_whatever_is_written_is_named():
     assert said.endswith("torque off was not confirmed")
 
 
-def test_joints_that_hold_a_position_are_left_alone(rig):
-    rig.cycle()
-    assert stand(rig.lines) == ()
-    assert rig.torque() == [True] * 8
-
-
 def test_a_wheel_stands_before_silent_ones_are_awaited_for_long():
     rig = wheels("AX-12A", 1.0, ids=(1, 2, 3, 4))
     rig.goals.velocity[:] = 1.0
@@ -181,3 +191,355 @@ def test_the_last_hand_waits_for_the_end_of_a_reply_that_is_on_its_way(rig, last
     last_hand(rig.lines)
     notes = [entry.note for entry in rig.ledger.entries if entry.t_ns > begun_ns]
     assert [note for note in notes if note.startswith("collision")] == []
+
+
+READ = 2  # Instruction of Protocol 1.0
+MILLISECOND_NS = 1_000_000
+PLAN = make_x((11,))
+ONE = access_servo(PLAN, PLAN.servos[0])
+
+
+def read_once(request: Transaction) -> Program[Reply]:
+    return (yield request)
+
+
+def delay_torque_reads(rig: Rig) -> Lines:
+    """Send one read of Torque Enable of each length, whose replies come 40 ms late; return the lines."""
+    lines, one = rig.lines, access_servo(rig.plans[0], rig.plans[0].servos[0])
+    for length in range(1, 2 + MOST_SPARE):
+        delay_next(rig.buses[0], 1, 40 * MILLISECOND_NS)
+        lines.run_programs([read_once(one.line.read_range(1, one.servo.torque_address, length))])
+    return lines
+
+
+def test_old_reading_does_not_confirm_torque_off():
+    rig = start_rig(make_plan((1,)))
+    servo = rig.servo(1)
+    servo.poke("torque_enable", 0)
+    lines = delay_torque_reads(rig)
+    rig.stick(1, "torque_enable", 1)
+    servo.poke("torque_enable", 1)
+    rig.when(lambda data: data[4] == READ, lambda: truncate_next(rig.buses[0], 1, 0))
+    (outcome,) = limp(lines)
+    assert not outcome.confirmed, "an old reply says 0, and the read-backs are lost"
+
+
+def test_torque_off_is_confirmed_while_older_readings_are_owed():
+    rig = start_rig(make_plan((1,)))
+    lines = delay_torque_reads(rig)
+    (outcome,) = limp(lines)
+    assert outcome.confirmed
+    assert not rig.servo(1).registers["torque_enable"]
+
+
+class Owed:
+    """Owed replies of one line with a clock that the test sets."""
+
+    def __init__(self) -> None:
+        self.at_ns = 0
+        self.replies = OwedReplies(lambda: self.at_ns)
+
+    def miss(self, request: Transaction, at_ns: int) -> None:
+        self.at_ns = at_ns
+        self.replies.add(request, 0, at_ns)
+
+    def write(self, request: Transaction, at_ns: int) -> None:
+        self.at_ns = at_ns
+        self.replies.note_change(request, at_ns)
+
+    def confuses(self, request: Transaction, at_ns: int) -> bool:
+        self.at_ns = at_ns
+        return self.replies.confuses(request, request.awaited[0], refusal=False, any_age=False)
+
+
+def test_retried_write_keeps_the_readings_after_its_first_attempt():
+    owed, write, read = Owed(), ONE.writing(64, b"\0"), ONE.reading(64, 1)
+    owed.write(write, 1)
+    owed.miss(read, 2)
+    owed.write(write, 3)
+    assert not owed.confuses(read, 4)
+
+
+def test_write_repeated_later_invalidates_older_readings():
+    owed, write, read = Owed(), ONE.writing(64, b"\0"), ONE.reading(64, 1)
+    owed.write(write, 1)
+    owed.miss(read, LEAST_WINDOW_NS)
+    owed.write(write, LEAST_WINDOW_NS + 1)
+    assert owed.confuses(read, LEAST_WINDOW_NS + 2)
+
+
+def test_reading_from_before_a_write_is_no_answer_however_often_it_was_repeated():
+    owed, write, read = Owed(), ONE.writing(64, b"\0"), ONE.reading(64, 1)
+    owed.miss(read, 1)
+    owed.write(write, 2)
+    owed.miss(read, 3)
+    assert owed.confuses(read, 4)
+
+
+def test_write_to_all_servos_invalidates_older_readings():
+    owed, read = Owed(), ONE.reading(64, 1)
+    owed.miss(read, 1)
+    owed.write(ONE.line.unanswered(protocol2.sync_write(64, 1, {ONE.servo.servo_id: b"\0"})), 2)
+    assert owed.confuses(read, 3)
+
+
+@pytest.mark.parametrize(("between", "confuses"), [(None, False), (ONE.writing(64, b"\1"), True)])
+def test_late_acknowledgement_counts_for_the_repetition_of_its_write(between, confuses):
+    owed, write = Owed(), ONE.writing(64, b"\0")
+    owed.write(write, 1)
+    owed.miss(write, 1)
+    if between is not None:
+        owed.write(between, 2)
+    owed.write(write, 3)
+    assert owed.confuses(write, 4) is confuses
+
+
+def test_slow_reply_widens_the_window_for_a_minute():
+    owed, read = Owed(), ONE.reading(64, 1)
+    owed.miss(read, 0)
+    owed.at_ns = slow_ns = 700 * MILLISECOND_NS
+    owed.replies.charge_reply(11, 1, 0)
+    assert owed.replies.window_ns == slow_ns * 5 // 4
+    owed.at_ns += SLOW_MEMORY_NS
+    assert owed.replies.window_ns == slow_ns * 5 // 4
+    owed.at_ns += 1
+    assert owed.replies.window_ns == LEAST_WINDOW_NS
+
+
+@pytest.mark.parametrize("register", [64, 65])
+def test_lost_reply_is_not_lateness_of_the_next_one(register):
+    """Neither the repetition of the lost read nor a read of another register of as many bytes is late."""
+    rig = start_rig(PLAN)
+    times = ReplyLateness()
+
+    def program() -> Program[Reply]:
+        yield ONE.reading(64, 1)
+        return (yield from retry(ONE.reading(register, 1)))
+
+    truncate_next(rig.buses[0], 11, 0)
+    (reply,) = rig.lines.run_programs([extend_timeouts(program(), times=times)])
+    assert reply is not None
+    assert reply.answered
+    assert all(each < MILLISECOND_NS for each in times.late_ns)
+    assert times.missing == 1
+
+
+def test_a_bus_without_power_is_given_up_within_two_seconds():
+    rig = start_rig(PLAN)
+    rig.servo(11).silence()
+
+    def program() -> Program[None]:
+        for _ in range(30):
+            yield from retry(ONE.reading(64, 1))
+
+    begun_ns = rig.clock.now_ns()
+    rig.lines.run_programs([extend_timeouts(program())])
+    assert rig.clock.now_ns() - begun_ns < 2_000 * MILLISECOND_NS
+
+
+EVERY_PAIR = 1_000_000  # more than there are
+FARTHEST = 8  # Requests between two faults: later, the first one is over
+KINDS = {
+    "lost": PacketFault("lost", lambda _: b""),
+    "doubled": PacketFault("doubled", bytes, copies=2),
+    **{f"{late} ms": PacketFault("late", bytes, late * 1_000_000) for late in (15, 260, 430, 600)},
+    **{f"stall of {late} ms": PacketFault(STALLED, bytes, late * 1_000_000) for late in (90, 300)},
+}
+MODELS = {1.0: "MX-28", 2.0: "XM430-W350"}
+COMMON = {"return_delay_time": 111, "temperature_limit": 71}
+ODD = {
+    1.0: COMMON
+    | {"cw_angle_limit": 2040, "ccw_angle_limit": 2060, "multi_turn_offset": 77, "resolution_divider": 3},
+    2.0: COMMON
+    | {"drive_mode": 4, "homing_offset": 77, "min_position_limit": 2040, "max_position_limit": 2060}
+    | {"startup_configuration": 3, "profile_acceleration": 55, "velocity_limit": 210, "position_p_gain": 640},
+}
+"""Settings that a start reports, each with a value of its own."""
+SILENT = re.compile(
+    r"(did|does|do) not (answer|confirm|acknowledge|belong)|no longer answers|answers only|garbled|missed|"
+    r"two-servos-have-one-id$|none of the|is probed once a second|answers again$|"
+    r"(reply was|replies in a row were) lost"
+)
+
+TORQUE_OFF = {"hardware: torque is off on the servo", "torque was switched off again on every servo"}
+Faults = Mapping[int, PacketFault]
+Reporting = Callable[[float, Faults], tuple[set[str], int]]
+"""Runs something on a servo of a protocol whose replies have faults; returns what it reported, each value by
+itself, and how many replies the servo sent."""
+
+
+def reported(sentences: Iterable[str]) -> set[str]:
+    """Return the parts of sentences that report something else than silence."""
+    parts = {part.strip() for one in sentences for line in one.splitlines() for part in line.split("; ")}
+    return {part for part in parts if not SILENT.search(part)}
+
+
+def plan_of(protocol: float, **change: object) -> BusPlan:
+    middle = {"reference": math.pi, "lower": -1.5, "upper": 1.5}
+    return make_plan((1,), protocol=protocol, model=MODELS[protocol], return_delay_ns=0, **middle, **change)
+
+
+def make_odd(bus: SimulatedBus, protocol: float) -> None:
+    for name, value in ODD[protocol].items():
+        bus.servo(1).poke(name, value)
+
+
+def texts(events: Sequence[tuple[object, ...]]) -> list[str]:
+    return [f"{source}: {text}" for _, _, source, text in events]
+
+
+def refused_start(protocol: float, faults: Faults) -> tuple[set[str], int]:
+    rig = make_rig(plan_of(protocol))
+    make_odd(rig.buses[0], protocol)
+    replies = disturb_replies(rig.buses[0], 1, faults)
+    with pytest.raises(StartUpError) as refusal:
+        rig.hardware.start()
+    return reported([*refusal.value.sentences, *texts(rig.events.list)]), replies()
+
+
+def start(protocol: float, faults: Faults) -> tuple[set[str], int]:
+    rig = make_rig(plan_of(protocol))
+    for name, value in COMMON.items():
+        rig.buses[0].servo(1).poke(name, value)
+    replies = disturb_replies(rig.buses[0], 1, faults)
+    sentences: Sequence[str] = ()
+    try:
+        rig.hardware.start()
+    except StartUpError as error:
+        sentences = error.sentences
+    found = reported([*sentences, *texts(rig.events.list)])
+    if any(text in TORQUE_OFF for text in found):  # after a start that failed: judged by the servo
+        assert not rig.servo(1).registers["torque_enable"]
+    return found - TORQUE_OFF, replies()
+
+
+def look_again(protocol: float, faults: Faults) -> tuple[set[str], int]:
+    """Inspect a servo in idle time that was lost, and has odd settings when it is back."""
+    rig = start_rig(plan_of(protocol))
+    rig.cycles(3)
+    servo = rig.servo(1)
+    servo.silence()
+    rig.cycles(6)
+    if protocol == 2.0:  # a servo with torque takes no other settings, but a hand may
+        rig.servo(1).poke("torque_enable", 0)
+    make_odd(rig.buses[0], protocol)
+    servo.silence(False)
+    before = len(rig.events.list)
+    replies = disturb_replies(rig.buses[0], 1, faults)
+    rig.cycles(120)
+    found = {re.sub(r"^.*is not ready: ", "", text) for text in texts(rig.events.list[before:])}
+    return reported(found), replies()
+
+
+def inspect_online(protocol: float, faults: Faults) -> tuple[set[str], int]:
+    plan, (line, _) = plan_of(protocol), tool_of(protocol)
+    replies = disturb_replies(line.bus, 1, faults)
+    identities = identify([plan], ["main_1_joint"], opened=lambda _: line).values()
+    found = {f"{one.joint} {one.model}: {one.problem}" for one in identities}
+    looked = inspect_buses([plan], opened=lambda _: line)
+    rows = {f"{row.item} {row.found}" for row in looked.registers if row.found is not None}
+    return reported([*found, *rows, *looked.problems, *looked.remarks]), replies()
+
+
+def tool_of(protocol: float) -> tuple[VirtualLine, ToolLine]:
+    line = VirtualLine(ServoConfig(1, MODELS[protocol], 2.0, 0), protocol=protocol, rate=1_000_000)
+    line.most_latency_ns = 1_000_000
+    make_odd(line.bus, protocol)
+    return line, ToolLine(line)
+
+
+def servo(protocol: float, faults: Faults) -> tuple[set[str], int]:
+    """Read, write, and switch torque as `dxlrun servo` does."""
+    line, tool = tool_of(protocol)
+    (found,) = find_servo(tool, 1, Search((protocol,), (1_000_000,)))
+    one = OneServo(tool, found)
+    replies = disturb_replies(line.bus, 1, faults)
+    said: list[str] = []
+
+    def read(*names: str) -> list[str]:
+        return [f"{name} {value}" for name, value in one.read_items(list(names)).items()]
+
+    singles = "temperature_limit", "return_delay_time", "id", "led", "torque_enable"
+    acts: list[Callable[[], Iterable[str]]] = [
+        *(partial(read, name) for name in singles),
+        lambda: read(*ODD[protocol]),
+        lambda: one.write_registers([one.register("temperature_limit", 65)]),
+        lambda: one.torque(True),
+        lambda: one.torque(False),
+    ]
+    for act in acts:
+        try:
+            said += act()
+        except ServoFault as error:
+            said += error.sentences
+    return reported(said), replies()
+
+
+def scan_line(protocol: float, faults: Faults) -> tuple[set[str], int]:
+    line, tool = tool_of(protocol)
+    replies = disturb_replies(line.bus, 1, faults)
+    said: list[str] = []
+    for found in scan(tool, Search((protocol,), (1_000_000,), (1, 2))).servos:
+        values = found.position, found.return_delay, found.lowest, found.highest
+        if found.model_number >= 0:
+            said.append(f"{found.servo_id} {found.model} {found.model_number} {found.firmware}")
+        names = ("position", "return_delay", "lowest", "highest")
+        said += [f"{name} {value}" for name, value in zip(names, values, strict=True) if value is not None]
+        said += found.remarks
+    return reported(said), replies()
+
+
+def set_up(protocol: float, faults: Faults) -> tuple[set[str], int]:
+    """Give a servo what a robot file has for it, and read it back, as `dxlrun setup` does."""
+    line, tool = tool_of(protocol)
+    table = find_table(MODELS[protocol], protocol)
+    wiring = Wiring("elbow", 0, 1, table, math.pi, 1, -1.5, 1.5)
+    plan = bus_plan(
+        name="main",
+        port=line.name,
+        baud_rate=1_000_000,
+        latency_ns=1_000_000,
+        return_delay_ns=0,
+        joints=[wiring],
+        protocol=protocol,
+    )
+    (found,) = find_servo(tool, 1, Search((protocol,), (1_000_000,)))
+    replies = disturb_replies(line.bus, 1, faults)
+    said: list[str] = []
+    try:
+        said += bring(OneServo(tool, found), plan, plan.servos[0])
+    except ServoFault as error:
+        said += error.sentences
+    survey = compare_servos(tool, plan, plan.servos)
+    said += [*survey.problems, *(text for _, text in survey.describe_deviations())]
+    return reported(said), replies()
+
+
+PROGRAMS = [refused_start, start, look_again, inspect_online, servo, scan_line, set_up]
+
+
+def draw_pairs(
+    replies: int, amount: float, chance: random.Random
+) -> list[tuple[tuple[int, str], tuple[int, str]]]:
+    """Return so many pairs of faults, or all that there are."""
+    every = [
+        ((first, one), (second, other))
+        for first in range(replies)
+        for second in range(first + 1, min(first + 1 + FARTHEST, replies + 3))
+        for one, other in itertools.product(KINDS, KINDS)
+    ]
+    return every if amount >= len(every) else chance.sample(every, int(amount))
+
+
+@campaign(ci=15, night=400, release=EVERY_PAIR)
+@pytest.mark.parametrize("protocol", MODELS)
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_late_doubled_and_lost_replies_change_no_reported_value(
+    program: Reporting, protocol: float, amount: float, chance: random.Random
+) -> None:
+    right, replies = program(protocol, {})
+    assert right
+    assert replies
+    for first, second in draw_pairs(replies, amount, chance):
+        found, _ = program(protocol, {number: KINDS[kind] for number, kind in (first, second)})
+        assert found <= right, (first, second)

@@ -1,7 +1,12 @@
+"""Serial and simulated ports: their latency timers, deadlines, and pyserial's and the maker's way to them."""
+
+from __future__ import annotations
+
 import errno
 import fcntl
 import os
 import pty
+import re
 import select
 import struct
 import subprocess
@@ -9,19 +14,34 @@ import sys
 import termios
 import time
 import tty
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
+from msgspec.structs import replace
 
 import dxlrun
 from dxlrun.channels.child_processes import memory_file
+from dxlrun.channels.heartbeat import (
+    LineProgress,
+    SimulationProgress,
+    create_progress,
+)
 from dxlrun.compile.robot_compiler import compile_files
+from dxlrun.dynamixel.remedies import CHECK, INJECTED, choose_remedy, describe_late_start, late_replies
 from dxlrun.dynamixel.tools.tool_port import TunablePort
-from dxlrun.errors import PortError, help_link
+from dxlrun.errors import PortError, StartUpError, help_link
+from dxlrun.plan.machine_load import MachineLoad
 from dxlrun.plan.robot_plan import to_json
 from dxlrun.process_table import robot_of
-from dxlwire.port.ports import SerialPort, SerialPorts
+from dxlrun.run.guardian import make_ports
+from dxlrun.testing import VirtualRobot, plan_of
+from dxlwire.bus_plan import SIMULATED
+from dxlwire.port.latency_timer import latency_timer, shorten
+from dxlwire.port.ports import LONGEST_STALL_NS, SerialPort, SerialPorts, SimulatedPort, StallCounter
 from dxlwire.port.reopening import KeptLines, LineSettings
 from dxlwire.port.serial_open import let_go, open_serial, rate_remark
 
@@ -263,3 +283,320 @@ def test_the_lock_goes_with_whoever_has_the_line_although_its_other_end_stays(te
 
 def _is_locked(descriptor: int) -> bool:
     return fcntl.ioctl(descriptor, 0x80045440, b"\0\0\0\0") == b"\1\0\0\0"  # TIOCGEXCL of asm-generic
+
+
+BUSY = MachineLoad(10.0, busy_s=10.0, no_idle_core_s=10.0)
+MS = 1_000_000
+
+
+@pytest.fixture
+def line():
+    master, slave = os.openpty()
+    yield os.ttyname(slave)
+    os.close(master)
+    os.close(slave)
+
+
+def timer_of(tmp_path, port, text):
+    """Write the file in which the kernel would show the timer of a port's adapter."""
+    place = tmp_path / "bus/usb-serial/devices" / os.path.basename(port) / "latency_timer"
+    place.parent.mkdir(parents=True)
+    place.write_text(text)
+    return place
+
+
+@pytest.fixture
+def timer(tmp_path, line):
+    return timer_of(tmp_path, line, "16\n")
+
+
+def shortened(line, most_ns, system):
+    with open_serial(line, 1_000_000) as port:
+        return shorten(port.fileno(), line, most_ns, system)
+
+
+def test_a_timer_is_shortened_where_it_is_longer_than_the_robot_file_says(tmp_path, line, timer):
+    assert shortened(line, 16 * MS, tmp_path) == ("", "")
+    assert timer.read_text() == "16\n"
+    assert shortened(line, MS, tmp_path) == (f"{line}: latency timer set from 16 ms to 1 ms", "")
+    assert timer.read_text() == "1"
+
+
+def test_an_adapter_without_a_timer_is_nobodys_fault(tmp_path, line):
+    assert latency_timer(line, tmp_path) is None
+    assert shortened(line, 0, tmp_path) == ("", "")
+
+
+@pytest.mark.parametrize("unreadable", ["", "soon", "16 ms"])
+def test_a_timer_that_says_no_number_is_none(tmp_path, line, unreadable):
+    timer_of(tmp_path, line, unreadable)
+    assert latency_timer(line, tmp_path) is None
+
+
+def test_a_timer_that_this_user_may_not_set_is_one_sentence_with_the_command(
+    tmp_path, line, timer, monkeypatch
+):
+    def forbidden(*_):
+        raise PermissionError
+
+    monkeypatch.setattr("pathlib.Path.write_text", forbidden)
+    done, wrong = shortened(line, MS, tmp_path)
+    assert done == ""
+    assert f"{line} delays replies by 16 ms instead of the planned 1 ms; run `echo 1 | sudo tee " in wrong
+    assert f"`echo 1 | sudo tee {timer}`" in wrong
+    with pytest.raises(PortError, match="sudo tee"):
+        KeptLines([LineSettings(line, 1_000_000, MS)], tmp_path)
+    with open_serial(line, 1_000_000):
+        pass  # a start that was refused let go of it
+
+
+def test_a_line_is_opened_with_its_timer_set(tmp_path, line, timer):
+    lines = KeptLines([LineSettings(line, 1_000_000, MS)], tmp_path)
+    assert lines.done == [f"{line}: latency timer set from 16 ms to 1 ms"]
+    lines.close()
+
+
+ROBOT = """\
+name: pair
+loop: {rate: 20}
+buses:
+  main:
+    {port: sim, protocol: 1.0, baud_rate: 1_000_000, return_delay_time: 100 us,
+    simulation: {latency_timer: 16 ms}}
+joints:
+  pan: {bus: main, id: 3, model: AX-12A, reference: 150 deg, direction: 1}
+  tilt: {bus: main, id: 7, model: AX-12A, reference: 150 deg, direction: 1}
+"""
+
+
+def with_a_timer(tmp_path, latency_ms, port="sim"):
+    """Return a robot whose simulated adapter keeps replies back for 16 ms, and a plan that expects less."""
+    path = tmp_path / "pair.yaml"
+    path.write_text(ROBOT)
+    plan = plan_of(path, duration_s=0.2)
+    robot = VirtualRobot(plan)
+    (bus,) = robot.robot.hardware._lines.buses
+    assert bus.plan is plan.buses[0]
+    bus.plan = replace(bus.plan, latency_ns=latency_ms * MS, port=port)
+    return robot
+
+
+def test_replies_later_than_planned_are_reported_before_any_servo_has_torque(tmp_path):
+    robot = with_a_timer(tmp_path, 1, "/dev/ttyUSB0")
+    with pytest.raises(StartUpError) as refusal:
+        robot.run()
+    assert refusal.value.for_replies
+    (sentence,) = refusal.value.sentences
+    start = (
+        r"the loop would miss most replies: (\d+) of \1 replies on bus main were delayed by up to 1[56] ms"
+    )
+    assert re.match(start, sentence), sentence
+    assert sentence.endswith(" (planned for the adapter: 1 ms)"), "nothing shows the cause"
+    torque_on = bytes.fromhex("0318")  # a write to Torque Enable (24)
+    sent = [entry.data for entry in robot.ledger.entries if entry.direction == "in"]
+    assert sent
+    assert not any(torque_on in data for data in sent)
+
+
+@pytest.mark.parametrize("latency_ms", [7, 16])
+def test_a_timer_that_the_reads_can_wait_for_is_no_reason_not_to_start(tmp_path, latency_ms):
+    robot = with_a_timer(tmp_path, latency_ms)
+    robot.run()
+    assert robot.record.states.valid.all()
+
+
+LINK = "/dev/serial/by-id/usb-FTDI"
+
+
+@pytest.mark.parametrize(
+    ("port", "extra_ms", "named"),
+    [
+        ("/dev/ttyUSB0", 15.9, "devices/ttyUSB0/latency_timer"),
+        (LINK, 12.0, f"devices/$(basename $(readlink -f {LINK}))/"),
+        ("/dev/ttyUSB0", 18.1, ""),
+        ("/dev/ttyUSB0", 11.9, ""),
+        ("sim", 16.0, ""),
+    ],
+)
+def test_only_what_looks_like_the_timer_is_called_one(port, extra_ms, named):
+    sentence, remedy = late_replies("main", port, extra_ms * MS, MS)
+    assert bool(remedy) == bool(named) == ("latency timer" in sentence)
+    assert named in remedy
+
+
+def test_busy_machine_comes_before_a_latency_timer():
+    sentence, remedy = late_replies("main", "/dev/ttyUSB0", 15.9 * MS, MS, BUSY)
+    assert "latency timer" not in sentence
+    assert remedy == "end other programs"
+
+
+@pytest.mark.parametrize(
+    ("port", "load", "remedy"),
+    [
+        ("/dev/ttyUSB0", MachineLoad(), CHECK),
+        ("/dev/ttyUSB0", BUSY, "end other programs"),
+        ("sim", MachineLoad(), INJECTED),
+        ("sim", BUSY, "end other programs, or use --virtual"),
+    ],
+)
+def test_remedy_is_for_the_machine_first_and_never_for_simulated_parts(port, load, remedy):
+    assert choose_remedy(port, CHECK, load=load) == remedy
+
+
+@pytest.mark.parametrize(("found", "named"), [("16\n", True), ("1\n", False), (None, False)])
+def test_late_start_names_the_timer_that_the_kernel_shows(tmp_path, found, named):
+    if found is not None:
+        timer_of(tmp_path, "ttyUSB7", found)
+    sentence = describe_late_start("main", "/dev/ttyUSB7", [15 * MS, 0, 14 * MS], MS, tmp_path)
+    assert sentence.startswith(
+        "2 of 3 replies on bus main were delayed by up to 15 ms (planned for the adapter: 1 ms)"
+    )
+    assert ("the adapter's latency timer is 16 ms: shorten it with `echo 1 | sudo tee" in sentence) is named
+
+
+ENDLESS_NS = 1 << 62  # nothing is due to the host
+SENT = 1_000 * MS  # when the request is off the wire
+DEADLINE = SENT + 12 * MS
+
+
+@pytest.fixture
+def memory() -> Iterator[int]:
+    descriptor = create_progress(2)
+    yield descriptor
+    os.close(descriptor)
+
+
+@pytest.fixture
+def simulation(memory: int) -> LineProgress:
+    """The simulation's side of a line."""
+    return SimulationProgress(memory).line(1)
+
+
+def publish_received(line: LineProgress, off_wire_ns: int) -> None:
+    line.words[0] = off_wire_ns
+
+
+def publish_served(line: LineProgress, until_ns: int) -> None:
+    line.words[1] = until_ns
+
+
+def publish_delivery(line: LineProgress, due_ns: int, now_ns: int) -> None:
+    line.words[3], line.words[2] = due_ns, now_ns
+
+
+@pytest.fixture
+def stalls() -> StallCounter:
+    return StallCounter()
+
+
+@pytest.fixture
+def port(memory: int, stalls: StallCounter) -> Iterator[SimulatedPort]:
+    ours, theirs = os.pipe()
+    yield SimulatedPort(ours, "sim", SimulationProgress(memory).line(1), stalls)
+    os.close(ours)
+    os.close(theirs)
+
+
+def extended(port: SerialPort, now: int, heard: int = 0) -> int:
+    return port.extend_deadline(DEADLINE, SENT, heard, now)
+
+
+def test_request_that_was_not_taken_is_awaited(port, simulation):
+    publish_received(simulation, SENT - 1)
+    publish_served(simulation, ENDLESS_NS)
+    assert extended(port, DEADLINE) == DEADLINE + MS
+
+
+def test_deadline_counts_from_when_the_request_was_taken(port, simulation):
+    publish_served(simulation, SENT + 100 * MS)
+    publish_received(simulation, SENT + 100 * MS)
+    assert extended(port, SENT + 101 * MS) > SENT + 101 * MS
+    publish_served(simulation, ENDLESS_NS)  # nothing is due any more: the servo is silent on purpose
+    assert extended(port, SENT + 102 * MS) <= SENT + 102 * MS
+
+
+def test_each_simulated_bus_has_its_own_progress(memory, simulation, stalls):
+    ours, theirs = os.pipe()
+    buses: Any = [SimpleNamespace(port=SIMULATED)] * 2
+    lines: Any = SimpleNamespace(simulation=memory)
+    first, second = make_ports(buses, ("one", "two"), (ours, theirs), lines, stalls)
+    publish_served(simulation, ENDLESS_NS)
+    publish_received(simulation, SENT + MS // 10)
+    assert extended(second, DEADLINE) <= DEADLINE < extended(first, DEADLINE)
+    os.close(ours)
+    os.close(theirs)
+
+
+def test_silent_servo_of_a_running_process_is_given_up_at_once(port, simulation, stalls):
+    publish_served(simulation, ENDLESS_NS)
+    publish_received(simulation, SENT + MS // 10)
+    assert extended(port, DEADLINE) <= DEADLINE
+    assert (stalls.times, stalls.waited_ns) == (0, 0)
+
+
+def test_reply_that_is_late_on_purpose_is_given_up_at_once(port, simulation):
+    """A latency timer of 16 ms: the process sleeps until the reply is due, which is behind the deadline."""
+    publish_served(simulation, SENT + 16 * MS)
+    publish_received(simulation, SENT)
+    assert extended(port, DEADLINE) <= DEADLINE
+
+
+def test_reply_that_was_due_and_was_not_handed_over_is_awaited(port, simulation):
+    publish_served(simulation, SENT + MS)  # when the reply is due; the process has not run since
+    publish_received(simulation, SENT)
+    assert extended(port, DEADLINE) > DEADLINE
+
+
+def test_bytes_that_the_kernel_still_has_are_awaited(port, simulation):
+    publish_received(simulation, SENT)
+    publish_delivery(simulation, SENT + MS, SENT + 11 * MS)
+    publish_served(simulation, ENDLESS_NS)
+    assert extended(port, DEADLINE, heard=SENT - MS) > DEADLINE
+    assert extended(port, DEADLINE, heard=SENT + 11 * MS) <= DEADLINE
+
+
+def test_wait_is_bounded_and_not_repeated_for_the_same_stall(port, simulation):
+    assert extended(port, SENT + LONGEST_STALL_NS - MS // 2) == SENT + LONGEST_STALL_NS
+    late = SENT + LONGEST_STALL_NS
+    assert extended(port, late) <= late
+    later, sent = late + 100 * MS, late + 80 * MS
+    assert port.extend_deadline(sent + 12 * MS, sent, 0, later) <= later
+    publish_received(simulation, late)  # the process runs again
+    assert port.extend_deadline(sent + 12 * MS, sent, 0, later) > later
+
+
+def test_waits_of_several_lines_count_once():
+    stalls = StallCounter()
+    for begin in (100, 101, 102):
+        for _line in range(3):
+            stalls.count(begin * MS, (begin + 1) * MS)
+    stalls.count(200 * MS, 201 * MS)
+    assert (stalls.times, stalls.waited_ns) == (2, 4 * MS)
+    stalls.count(203 * MS, 204 * MS)  # the same wait goes on, after a wake-up that was late
+    assert (stalls.times, stalls.waited_ns) == (2, 7 * MS)
+
+
+def test_real_port_never_extends_a_deadline(port):
+    real = SerialPort(port.descriptor, "/dev/ttyUSB0")
+    assert extended(real, DEADLINE) == DEADLINE
+    assert (real.late_ns(0, 9), real.stalled_ns(0, 9)) == (0, 0)
+
+
+def test_late_reply_is_split_into_what_its_process_was_late(port, simulation):
+    publish_received(simulation, SENT + 5 * MS)
+    publish_delivery(simulation, SENT + 6 * MS, SENT + 9 * MS)
+    assert port.late_ns(SENT, SENT + 10 * MS) == (5 + 4) * MS
+
+
+def test_stalls_count_as_far_as_they_overlap(memory, port):
+    progress = SimulationProgress(memory)
+    for second in range(20):  # more than are kept
+        progress.note_stall(second * 1_000 * MS, (second * 1_000 + 100) * MS)
+    assert port.stalled_ns(18_050 * MS, 19_050 * MS) == (50 + 50) * MS
+    assert port.stalled_ns(18_200 * MS, 18_900 * MS) == 0
+    assert port.stalled_ns(0, 2_000 * MS) == 0  # forgotten
+
+
+def test_port_of_a_line_that_is_back_keeps_its_progress(port, simulation):
+    publish_received(simulation, SENT - 1)
+    assert extended(port.renewed(), DEADLINE) > DEADLINE

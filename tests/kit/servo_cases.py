@@ -31,6 +31,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import pytest
 from msgspec.structs import replace
 from tests.kit.cases import TextCase
 from tests.kit.line_faults import corrupt_next, delay_next, truncate_next, turn_by_hand
@@ -38,6 +39,7 @@ from tests.kit.plans import make_plan
 from tests.kit.rigs import Rig, every_servo, make_rig, make_x
 
 from dxlrun.channels.cycle import Torque
+from dxlrun.dynamixel.servo.torque_off import stand
 from dxlrun.errors import StartUpError, help_link
 from dxlsim.servo.simulated_servo import SimulatedServo
 from dxlsim.simulation_plan import ServoConfig
@@ -49,6 +51,12 @@ CASES = Path(__file__).parents[1] / "dynamixel" / "cases"
 HELP = help_link("")
 ROUTINE = ("setup ", "torque on ", "torque off ", "read lost ", "read back ", "answered")
 """How reports begin that a case may leave out."""
+
+PLANNED: dict[str, tuple[str, Callable[[str], object]]] = {
+    "starts in": ("start_mode", lambda value: Mode[value.upper()]),
+    "reference": ("reference", lambda value: math.radians(float(value))),
+}
+"""Options of servos that the plan has under another name."""
 
 
 @dataclass
@@ -178,8 +186,9 @@ class Case:
                 self.options[name] = float(value) if name == "position" else int(value)
             elif option == "continuous":
                 given |= {"continuous": True, "lower": -math.inf, "upper": math.inf}
-            elif name == "starts in":
-                given["start_mode"] = Mode[value.upper()]
+            elif name in PLANNED:
+                key, read = PLANNED[name]
+                given[key] = read(value)
             elif option:
                 lower, upper = option.removeprefix("limits ").split()
                 given |= {"lower": float(lower), "upper": float(upper)}
@@ -200,6 +209,17 @@ class Case:
             servo, settings=tuple(sorted(wanted, key=lambda one: not one.eeprom))
         )
         self.plan = replace(self.plan, servos=tuple(servos))
+
+    def expect_offset(self, servo_id: str, offset: str) -> None:
+        """Let the robot file expect a Homing Offset of a servo, which is then part of its ticks."""
+        value = RegisterValue(20, 4, int(offset), "homing_offset", True, False)
+        moved = [
+            replace(one.moved(int(offset)), homing_offset=int(offset), expected=(value,))
+            if one.servo_id == int(servo_id)
+            else one
+            for one in self.plan.servos
+        ]
+        self.plan = replace(self.plan, servos=tuple(moved))
 
     def change_servo(self, servo_id: str, changes: str) -> None:
         for change in changes.split(", "):
@@ -229,7 +249,33 @@ class Case:
     def stop(self) -> None:
         self.said += [f"stopped: {sentence}" for sentence in self.rig.hardware.stop()]
 
+    def give_goal(self, servo_id: str, goals: str) -> None:
+        """Give a joint these goals, and none of other interfaces."""
+        row = self.row(servo_id)
+        self.rig.goals.values[:, row] = math.nan
+        for interface, goal in (one.split() for one in goals.split(", ")):
+            getattr(self.rig.goals, interface)[row] = float(goal)
+
+    def limit_torque(self, share: str, full: str) -> None:
+        """Let a policy reduce the torque of all servos."""
+        self.rig.hardware._full_torque = [[int(full)] * len(self.ids)]
+        self.rig.hardware.limit_torque(float(share))
+
+    def stand(self) -> None:
+        """Let the guardian stop the wheels of a loop that died."""
+        self.said += [f"stood: {sentence}" for sentence in stand(self.rig.lines)]
+
     # Expectations
+
+    def expect_place(self, servo_id: str, degrees: str) -> None:
+        """Compare the shaft with an angle from raw 0, which friction leaves by some ticks, and the state."""
+        servo = self.plan.servos[self.row(servo_id)]
+        angle, tick = math.radians(float(degrees)), servo.rad_per_tick
+        off = math.remainder(self.rig.servo(int(servo_id)).shaft_angle - angle, math.tau)
+        assert abs(off) < 3.6 * tick, f"the shaft is {math.degrees(off):.2f} deg off"
+        raw = servo.reference - (servo.homing_offset or 0) * tick
+        joint = servo.direction * (angle + off - raw) * servo.ratio
+        assert self.rig.states.position[servo.row] == pytest.approx(joint, abs=tick), math.degrees(joint)
 
     def expect_ids(self, found: Sequence[int], ids: str) -> None:
         named = {"all": self.ids, "none": []}
@@ -294,6 +340,7 @@ def do_one(
 SETUP: dict[str, Callable[..., object]] = {
     r"servos: (\S+) ([\d ]+)(?:, (.+))?": Case.plan_servos,
     r"declared (\d+): (.+)": Case.declare,
+    r"expected (\d+): homing_offset (-?\d+)": Case.expect_offset,
     r"another: (\S+) (\d+)": lambda case, model, servo_id: case.options.update(
         extra=(ServoConfig(int(servo_id), model, 0.7, 440_000),)
     ),
@@ -317,6 +364,9 @@ AFTER_START: dict[str, Callable[..., object]] = {
         case.row(servo_id), name, int(value), case.answer
     ),
     r"mode (\d+): (\w+)": Case.change_mode,
+    r"goal (\d+): (.+)": Case.give_goal,
+    r"torque limited to (\S+) of (\d+)": Case.limit_torque,
+    r"the loop dies": Case.stand,
     r"bus unplugged": lambda case: case.rig.buses[0].unplug(),
     r"bus plugged in": lambda case: case.rig.buses[0].plug_in(),
     r"stop": Case.stop,
@@ -334,6 +384,12 @@ CHANGES: dict[str, Callable[..., object]] = {
     ),
     r"turned (\d+) ticks (above|below) its limits": turn_beyond,
     r"turned by (\S+) rad": lambda _, servo, angle: turn_by_hand(servo, servo.shaft_angle + float(angle)),
+    r"turned to (\S+) deg": lambda _, servo, angle: turn_by_hand(servo, math.radians(float(angle))),
+    # from raw 0, as it is after its power was off
+    r"placed at (\S+) deg": lambda _, servo, angle: (
+        turn_by_hand(servo, math.radians(float(angle))),
+        servo.power_cycle(),
+    ),
     r"reply lost": lambda case, servo: truncate_next(case.rig.buses[0], servo.servo_id, 0),
     r"reply cut": lambda case, servo: truncate_next(case.rig.buses[0], servo.servo_id, 5),
     r"reply corrupted": lambda case, servo: corrupt_next(case.rig.buses[0], servo.servo_id),
@@ -356,4 +412,5 @@ EXPECTATIONS: dict[str, Callable[..., object]] = {
         [address for one, address, _ in case.rig.writes() if one == int(servo_id)], addresses
     ),
     r"mode (\d+): (\w+)": Case.expect_mode,
+    r"(\d+) is at (\S+) deg": Case.expect_place,
 }
