@@ -6,6 +6,7 @@ Each page with commands has a test that runs them, such as tests/cli/test_pages.
 from __future__ import annotations
 
 import ast
+import json
 import re
 import tomllib
 from pathlib import Path
@@ -261,3 +262,48 @@ def test_contributing_md_is_short_and_has_what_ci_runs() -> None:
     (extras,) = re.findall(r"^    .*install -e '\.\[(.+)\]'$", page, re.MULTILINE)
     every = set(tomllib.loads(PROJECT)["project"]["optional-dependencies"])
     assert set(extras.split(",")) == every - {"release", "full"}  # of 101 and 380 MB
+
+
+PICTURES = ROOT / "docs" / "pictures"
+NAMES = tuple(json.loads((PICTURES / "inputs.json").read_text()))
+
+
+def test_check_names_the_picture_and_the_command_when_an_input_changed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(PICTURES))
+    import inputs  # a script of docs/pictures
+
+    texts = {"pan": {"robots/pan.yaml": "rate: 50", "drawing": "<svg/>"}, "tilt": {"drawing": "<svg/>"}}
+    monkeypatch.setattr(inputs, "HASHES", tmp_path / "inputs.json")
+    monkeypatch.setattr(
+        inputs,
+        "inputs_of_pictures",
+        lambda _: {
+            name: {one: lambda text=text: text for one, text in found.items()}
+            for name, found in texts.items()
+        },
+    )
+    inputs.record(["pan", "tilt"])
+    assert inputs.stale() == []
+    texts["pan"]["robots/pan.yaml"] = "rate: 100"
+    assert inputs.stale() == ["pan: robots/pan.yaml changed; run python docs/pictures/make.py pan"]
+    inputs.record(["pan"])
+    assert inputs.stale() == []
+
+
+def test_the_pages_show_them_and_they_are_small() -> None:
+    shown = {
+        (path.parent / target).resolve()
+        for path in (ROOT / "README.md", *DOCS.values())
+        for target in re.findall(r"!\[[^\]]+\]\(([^)\s]+)\)", path.read_text())
+    }
+    assert shown == {path for path in PICTURES.iterdir() if path.suffix in {".png", ".svg"}}
+    assert {path.stem for path in shown} == set(NAMES)
+    assert len(shown) >= 20
+    assert sum(one.stat().st_size for one in shown) < 3_000_000
+    for one in shown:
+        assert one.stat().st_size < 200_000, one
+        if one.suffix == ".svg":
+            text = one.read_text()
+            assert not re.search(r"(href|src)=\"(?!#|data:)|url\((?!#)|@import|<script", text), one
