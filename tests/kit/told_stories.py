@@ -9,6 +9,7 @@ The texts have the form of `tests/kit/cases.py`. The head is a robot file, or a 
       play                             the motion of this text, one of `robots/motions`, or a name
       jam servo=2 at=500ms             a fault, as `dxlrun --fault` has it
       hand servo=2 by=-30 at=1300ms    a hand turns a shaft by degrees at once, against the servo
+      poke servo=2 max_torque 500      a register before the run
       mute servo=2 at=500ms for=60ms   replies are lost, while the servo executes its instructions
       at 0.2 arm trajectory {points: [{time: 1, positions: [0.7, 0]}]}
       at 0.9 cancel {controller: arm}
@@ -72,6 +73,7 @@ class Story:
         self.play, self.asks, self.faults = list[Path | str](), list[Ask](), list[Any]()
         self.hands: list[tuple[int, float, int]] = []
         self.mute: list[tuple[int, ...]] = []
+        self.pokes: list[tuple[int, str, int]] = []
         self.goals: list[dict[str, Any]] = []
         self.shafts: dict[int, list[float]] = {number: [] for number in shafts}
 
@@ -99,6 +101,9 @@ class Story:
             match = re.fullmatch(r"servo=(\d+) at=(\d+)ms for=(\d+)ms", rest)
             assert match, "write mute servo=ID at=TIMEms for=TIMEms"
             self.mute.append(tuple(map(int, match.groups())))
+        elif word == "poke":
+            servo, item, value = rest.removeprefix("servo=").split()
+            self.pokes.append((int(servo), item, int(value)))
         elif word in KINDS:
             self.faults.append(parse_fault(line))
         else:
@@ -123,6 +128,8 @@ class Story:
         for number, by, at_ns in self.hands:
             servo = robot.buses[0].servo(number)
             robot.buses[0].at(at_ns, partial(self._turn, servo, by))
+        for number, item, value in self.pokes:
+            robot.buses[0].servo(number).poke(item, value)
         for number, at_ms, for_ms in self.mute:
             lose_replies(robot.buses[0], number, at_ms * 1_000_000, (at_ms + for_ms) * 1_000_000)
         self._watch(robot)
@@ -170,7 +177,7 @@ class Story:
             assert least <= (lasted := self.virtual.clock.now_ns() * 1e-9) <= most, lasted
         elif word == "wrote":
             servo, _, rest = rest.partition(" ")
-            item, _, values = rest.partition(": ")
+            item, _, values = rest.partition(":")
             found = list(self._written(int(servo), item))
             assert found == [int(value) for value in values.split()], found
         elif word == "fails":

@@ -13,13 +13,11 @@ import numpy as np
 import pytest
 from msgspec.structs import force_setattr
 from tests.kit.line_faults import truncate_next, watch_instructions
-from tests.kit.sampled_run import SampledRun, changes_of
-from tests.kit.stories import ask, rate, send, switch
-from tests.kit.wire import all_writes
+from tests.kit.sampled_run import SampledRun
+from tests.kit.stories import ask, send, switch
 
 from dxlrun.channels.answers import Code, Refusal
 from dxlrun.errors import StartUpError
-from dxlrun.plan.policy_plan import SLOW_SPEED
 from dxlsim.wire.servo_packets import Instruction, InstructionPacket
 
 ROBOT = """\
@@ -185,22 +183,6 @@ def check_pose(run: Three) -> None:
     assert yaw[-1][1] == yaw[0][1]
 
 
-def test_a_pose_after_a_pause_begins_slowly(built):
-    run = built(on_exit="[{pose: home, speed: 180 deg/s}, limp]")
-    run.ask(2000, ask("pause"))
-    run.at(2500, run.robot.stop.request)
-    run.run("stopped")
-    assert run.sent_goals("pan")[-1][1] == HOME["pan"]
-    assert run.largest_step("pan") < SLOW_SPEED * 0.02 + TICK
-
-
-def test_the_end_of_a_run_is_an_exit(built):
-    run = built(0.5, on_exit=STEPS["pose"])
-    run.run()
-    check_pose(run)
-    assert run.has_torque() == {False}
-
-
 def test_controllers_are_deactivated_before_a_policy_moves_and_requests_are_refused(built, acts):
     active: list[int] = []
     acts["pair"] = lambda controller, time_ns: active.append(time_ns)
@@ -214,44 +196,6 @@ def test_controllers_are_deactivated_before_a_policy_moves_and_requests_are_refu
     assert set(masks[: len(active)]) == {0b11}
     assert run.answer(1) == Refusal(Code.RUN_ENDING)
     check_pose(run)
-
-
-@pytest.mark.parametrize("seen", [False, True])
-def test_a_joint_that_cannot_reach_its_pose_is_said_and_does_not_keep_the_robot_from_its_end(
-    built, acts, seen
-):
-    run = built(on_exit=STEPS["pose"])
-    stop_signal(run, acts)
-    servo = run.servos["pan"]
-    servo.wakes_on_goal = False
-    back_ns = (START_MS - 50) * 1_000_000
-    run.at(START_MS - 100, lambda: servo.cut_power(back_ns) if seen else servo.poke("torque_enable", 0))
-    log = run.run("stopped")
-    assert servo.shaft_angle < (HOME["pan"] - 20) * TICK
-    limp = "is limp: it was reset, its torque was cut, or it shut itself down"
-    assert [event.text for event in log.events if "not reached" in event.text] == [
-        "on_exit: pose home at 60 deg/s is not reached: joint pan "
-        f"{limp if seen else 'is 0.352 rad off'}; now limp"
-    ]
-    assert run.robot.clock.now_ns() < START_MS * 1e6 + 2_600_000_000
-    assert run.has_torque() == {False}
-
-
-def test_a_reply_that_is_lost_as_the_pose_is_reached_does_not_end_it_before_the_servo_has_its_goal(
-    built, acts
-):
-    run = built(on_exit=STEPS["pose"])
-    stop_signal(run, acts)
-    run.run("stopped")
-    there_ms = next(ms for ms, now in run.sent_goals("pan") if now == HOME["pan"])
-    run = built(on_exit=STEPS["pose"])
-    stop_signal(run, acts)
-    servo = run.servos["pan"]
-    run.at(there_ms - 30, servo.silence)
-    run.at(there_ms + 10, lambda: servo.silence(False))
-    run.run("stopped")
-    assert run.sent_goals("pan")[-1][1] == HOME["pan"]
-    assert servo.shaft_angle == pytest.approx(HOME["pan"] * TICK, abs=0.1)
 
 
 def test_steps_are_cut_short_when_the_time_for_them_is_over(built, acts):
@@ -281,39 +225,6 @@ def test_periods_are_skipped_behind_the_end_of_the_motions_too(built):
     assert np.diff(woken[10:]).min() >= 20_000_000, "two cycles never follow each other in a burst"
 
 
-@pytest.mark.parametrize(("hz", "refused"), [(1.0, True), (25.0, False)])
-def test_a_rate_at_which_the_policies_would_not_end_in_time_is_refused(built, hz, refused):
-    run = built(0.1, on_exit="[{pose: home, speed: 30 deg/s}, limp]")
-    number = run.ask(0, rate(hz))
-    run.robot.run()
-    answer = run.answer(number)
-    assert (isinstance(answer, Refusal) and answer.code is Code.RATE_UNDER_EXIT) is refused
-
-
-@pytest.mark.parametrize("steps", ["pose", "less torque"])
-def test_without_a_line_its_servos_are_lost_and_the_policy_for_them_ends_the_run(built, steps):
-    run = built(on_lost_servo=STEPS[steps])
-    run.at(START_MS, run.bus.unplug)
-    result = run.robot.run()
-    assert (result.reason, result.last) == ("fault", "limp" if steps == "pose" else "hold")
-    assert "pan, tilt, yaw missed at least 3 replies in a row" in result.detail
-    assert run.limits("pan") == []
-    assert len(run.robot.failures) == (3 if steps == "pose" else 0)
-
-
-@pytest.mark.parametrize("policies", [{}, {"on_fault": STEPS["less torque"]}])
-def test_a_start_restores_a_torque_limit_that_is_lowered(built, policies):
-    run = built(0.1, **policies)
-    run.servos["tilt"].poke("torque_limit", 307)
-    run.run()
-    assert run.limits("tilt") == [1023]
-    assert run.limits("pan") == []
-    writes = all_writes(run.robot.ledger.entries, run.plan.buses[0])
-    order = [at for _, servo, at, _ in writes if servo == 7]
-    weak = "a weak servo may have sagged: its goal comes first"
-    assert order[:3] == [GOAL, TORQUE_ENABLE, TORQUE_LIMIT], weak
-
-
 def test_a_start_ends_when_a_servo_may_be_left_weak(built):
     run = built(0.1, on_fault=STEPS["less torque"])
     run.servos["tilt"].poke("torque_limit", 307)
@@ -330,51 +241,3 @@ def test_a_start_ends_when_a_servo_may_be_left_weak(built):
     with pytest.raises(StartUpError, match=re.escape(said)):
         run.robot.run()
     assert run.has_torque() == {False}
-
-
-CURL = (
-    "single: {type: joint_group_position_controller, joints: [yaw]}",
-    "single: {type: keyframe_player, joints: [yaw], ACTIVE, motions: {curl: {steps: ["
-    "{time: 200 ms, pose: {yaw: 5 deg}, torque: {yaw: 0.5}}, "
-    "{time: 200 ms, pose: {yaw: -5 deg}, torque: {yaw: 0.2}}]}}}",
-)
-
-
-def test_poses_of_protocol_1_limit_the_torque_and_the_mode_after_them_gives_it_back(built):
-    change = CURL[0], CURL[1].replace("ACTIVE", "start: curl")
-    end = "[{pose: level, speed: 60 deg/s}, hold]"
-    run = built(1.0, change=change, on_exit=end, more="  level: {yaw: 0 deg}\n")
-    run.servos["yaw"].poke("max_torque", 800)
-    run.robot.run()
-    assert [*changes_of(run.limits("yaw"))] == [800, 512, 205, 800]
-    assert run.limits("pan") == []
-    assert run.has_torque() == {True}
-
-
-def test_a_start_gives_back_the_torque_that_a_pose_of_an_earlier_run_took(built):
-    run = built(0.1, change=(CURL[0], CURL[1].replace("ACTIVE", "active: false")))
-    run.servos["yaw"].poke("torque_limit", 205)
-    run.run()
-    assert run.limits("yaw") == [1023]
-
-
-def test_less_torque_is_a_fraction_of_what_the_servo_may_by_itself(built, acts):
-    run = built(on_exit=STEPS["less torque"])
-    run.servos["pan"].poke("max_torque", 500)
-    stop_signal(run, acts)
-    run.robot.run()
-    assert run.limits("pan") == [500, 383, 267, 150]  # first at the start-up
-
-
-def test_on_protocol_2_the_pwm_is_reduced(tmp_path):
-    text = (
-        "name: one\n"
-        "buses: {main: {port: sim, protocol: 2.0, baud_rate: 1_000_000, return_delay_time: 100 us}}\n"
-        "loop: {rate: 50}\n"
-        "joints: {pan: {bus: main, id: 3, model: XM430-W350, reference: 180 deg, direction: 1}}\n"
-        "policies: {on_exit: [{reduce_torque: 0.4, steps: 2, over: 200 ms}, hold]}\n"
-    )
-    run = SampledRun(tmp_path, text, 0.2)
-    run.run()
-    assert [value for _, value in run.goals("pan", 100, 2)] == [round(885 * 0.7), round(885 * 0.4)]
-    assert run.servos["pan"].torque_on
