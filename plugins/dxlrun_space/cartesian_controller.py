@@ -270,7 +270,9 @@ class CartesianController(Controller[CartesianParameters]):
         self._turns_with_tip = False
         self._is_held = self._is_ignoring = False
         self._followed: Pose | None = None
-        """Pose that moves toward the leader's, and that the tip has."""
+        """Pose that moves toward the leader's."""
+        self._sought: Positions = ()
+        """Positions of the followed pose, which the joints approach."""
         self._stream.drop_twist()
 
     def on_activate(self, time_ns: int) -> None:
@@ -532,8 +534,9 @@ class CartesianController(Controller[CartesianParameters]):
         self._followed = shifted(
             begin, (a * period_s, b * period_s, c * period_s), (u * period_s, v * period_s, w * period_s)
         )
+        sought = self._sought or self._at
         search = self._solver.search_from(
-            self._followed, self._at, exact=self._exact, steps=self._steps // 2 + 2
+            self._followed, sought, exact=self._exact, steps=self._steps // 2 + 2
         )
         try:
             while True:
@@ -544,10 +547,12 @@ class CartesianController(Controller[CartesianParameters]):
             way, _ = distance(self._followed, self._chain.pose(found.positions))
             share = 1 - LEASH_M / left
             self._followed = shifted(self._followed, (way[0] * share, way[1] * share, way[2] * share), _ZERO)
-        self._at = tuple(
-            now + min(max(goal - now, -most * period_s), most * period_s)
-            for goal, now, most in zip(found.positions, self._at, self._limits.velocity, strict=True)
-        )
+        rows = zip(found.positions, sought, self._at, self._limits.acceleration, strict=True)
+        speeds = [
+            (goal - before) / period_s + approach((before - now, 0.0, 0.0), most, period_s)[0]
+            for goal, before, now, most in rows
+        ]
+        self._at, self._sought = self._stream.turn_joints(self._at, speeds, period_s), found.positions
 
 
 def _remark(path: Path, asked: PoseGoal) -> str:

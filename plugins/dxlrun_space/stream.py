@@ -90,7 +90,13 @@ class TwistMotion:
         weight = self._weight
         right = [a * x + b * y + c * z + weight * (d * u + e * v + f * w) for a, b, c, d, e, f in columns]
         speeds = solve(normal_matrix(columns, weight, self._damping), right)
-        scale = 1.0
+        return self.turn_joints(positions, speeds, period_s)
+
+    def turn_joints(
+        self, positions: Sequence[float], speeds: Sequence[float], period_s: float
+    ) -> tuple[float, ...]:
+        """Return the joint positions after a period at speeds that are limited, rad/s or m/s."""
+        self.held_by, scale = -1, 1.0
         for index, (speed, now) in enumerate(zip(speeds, positions, strict=True)):
             share = self._highest(index, now, speed, period_s) / max(abs(speed), 1e-12)
             if share < scale:

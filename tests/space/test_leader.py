@@ -91,6 +91,7 @@ def test_a_leader_beyond_reach_is_followed_to_the_edge_and_back() -> None:
     assert np.abs(rows[199] - rows[190]).max() < 1e-3, "it rests at the edge"
     assert FOLLOWER.matrix(rows[-1])[:3, 3] == pytest.approx(2 * LEADER.matrix(near)[:3, 3], abs=1e-3)
     assert np.abs(np.diff(rows, axis=0)).max() <= 4.8 * 0.02 * 1.01
+    assert np.abs(np.diff(rows, 2, axis=0)).max() <= 20.0 * 0.02**2 * 1.01, "near the edge a joint leaps"
 
 
 def test_a_leader_that_does_not_answer_is_waited_for() -> None:
