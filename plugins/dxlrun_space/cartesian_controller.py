@@ -213,7 +213,7 @@ class CartesianController(Controller[CartesianParameters]):
         if parameters.leader is not None:
             raise ValueError(f"the tip follows a leader; a {kind} is not accepted")
         if isinstance(command, PoseCommand | TwistCommand):
-            return packed(command.as_goal)
+            return packed(command.as_goal(parameters.joints))
         return super().prepare(kind, command, parameters)
 
     @classmethod
@@ -419,10 +419,17 @@ class CartesianController(Controller[CartesianParameters]):
             frame = self._pose_of(asked.frame)
         except ValueError as error:
             return NoPath(str(error))
-        self._target = asked.target(frame, self._chain.pose(self._at))
-        plan = plan_line if asked.by_line else plan_joints
-        exact = self._exact and asked.asks_orientation
-        planning = plan(self._solver, self._at, self._target, self._limits, exact=exact)
+        solver, exact = self._solver, self._exact and asked.asks_orientation
+        if asked.positions:
+            self._target = self._chain.pose(asked.positions)
+        else:
+            self._target = asked.target(frame, self._chain.pose(self._at))
+        if asked.by_line:
+            planning = plan_line(solver, self._at, self._target, self._limits, exact=exact)
+        else:
+            planning = plan_joints(
+                solver, self._at, self._target, self._limits, exact=exact, near=asked.positions
+            )
         found: Path | NoPath | None = None
         while found is None:
             for _ in range(self._steps):

@@ -23,7 +23,13 @@ def compile_tip_poses(compilation: Compilation) -> Contribution:
     file, poses, rows = compilation.file, dict[str, dict[str, float]](), list[Row]()
     for name, pose in form.STAGE.section_of(file.robot).items():
         try:
-            if (found := _solved(compilation, pose)) is not None:
+            if (chain := _chain(compilation, pose)) is None:
+                continue
+            if omitted := next((joint for joint in chain.joints if joint in file.description.omitted), ""):
+                what = f"pose {name} is omitted, because {omitted} moves {pose.tip}"
+                file.warning(file.key("tip_poses", name), what, f"run with {omitted} to have it")
+                poses[name] = {}
+            elif (found := _solved(compilation, chain, pose)) is not None:
                 poses[name] = found["joints"]
                 rows.append({"name": name, "tip": pose.tip, **found})
         except WrongChain as wrong:
@@ -31,19 +37,20 @@ def compile_tip_poses(compilation: Compilation) -> Contribution:
     return Contribution(poses=poses, plan=msgspec.json.encode(rows))
 
 
-def _solved(compilation: Compilation, pose: form.TipPose) -> Row | None:
-    """Return the row of a pose with its joints; None if the URDF or a joint has an error already."""
+def _chain(compilation: Compilation, pose: form.TipPose) -> Chain | None:
+    """Return the chain of a pose; None if the URDF has an error already."""
     file, body = compilation.file, compilation.body
-    if body is None:
-        if file.robot.model is None:
-            raise WrongChain("tip", "the robot file names no URDF", "write `model: {urdf: NAME.urdf}`")
-        return None
-    chain = Chain(body.urdf, pose.base, pose.tip)
+    if body is not None:
+        return Chain(body.urdf, pose.base, pose.tip)
+    if file.robot.model is None:
+        raise WrongChain("tip", "the robot file names no URDF", "write `model: {urdf: NAME.urdf}`")
+    return None
+
+
+def _solved(compilation: Compilation, chain: Chain, pose: form.TipPose) -> Row | None:
+    """Return the row of a pose with its joints; None if a joint has an error already."""
     for joint in chain.joints:
-        if joint in file.description.omitted:
-            what = f"{joint} moves {pose.tip}, but is omitted"
-            raise WrongChain("tip", what, f"remove the pose, or run with {joint}")
-        if joint not in file.robot.joints:
+        if joint not in compilation.file.robot.joints:
             raise WrongChain("tip", f"{joint} moves {pose.tip}, but has no servo", f"add {joint} to `joints`")
     for joint in pose.near:
         if joint not in chain.joints:
@@ -55,7 +62,7 @@ def _solved(compilation: Compilation, pose: form.TipPose) -> Row | None:
     solver = Solver(chain, [plan.lower for plan in plans], [plan.upper for plan in plans], near)
     start = tuple(each or 0.0 for each in near)
     try:
-        goal = PoseCommand.model_validate(pose.model_dump(include=_GOAL)).as_goal
+        goal = PoseCommand.model_validate(pose.model_dump(include=_GOAL)).as_goal()
     except ValidationError as error:
         what, _, fix = error.errors()[0]["msg"].removeprefix("Value error, ").partition("; ")
         raise WrongChain("", what, fix or "remove the others") from None

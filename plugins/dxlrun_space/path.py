@@ -146,10 +146,10 @@ Planning = Generator[None, None, Path | NoPath]
 
 
 def plan_joints(
-    solver: Solver, start: Positions, target: Pose, limits: MotionLimits, *, exact: bool
+    solver: Solver, start: Positions, target: Pose, limits: MotionLimits, *, exact: bool, near: Positions = ()
 ) -> Planning:
-    """Plan a motion in which all joints turn evenly from the start to the pose."""
-    found = yield from solver.search(target, start, exact=exact)
+    """Plan a motion in which all joints turn evenly from the start to a solution `near` others."""
+    found = yield from solver.search(target, near or start, exact=exact)
     if not suffices(found.residual, exact):
         return NoPath(out_of_reach(found.residual, exact))
     ways = [b - a for a, b in zip(start, found.positions, strict=True)]

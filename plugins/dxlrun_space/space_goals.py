@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Final, Literal, Self, TypeVar
 
 import msgspec
@@ -66,6 +67,8 @@ _Frame = Annotated[str, Field(max_length=_LONGEST_NAME)]
 class PoseCommand(CommandModel):
     """Goal pose of the tip. A coordinate that is not given keeps its value at the start"""
 
+    pose: Mapping[str, float] | None = None
+    """Name of a pose of the robot file, in place of the coordinates; all joints turn evenly to it"""
     x: _Metres | None = None
     """Goal position in the frame, m"""
     y: _Metres | None = None
@@ -94,9 +97,14 @@ class PoseCommand(CommandModel):
             if getattr(self, axis) is not None and getattr(self, f"d{axis}") is not None:
                 raise ValueError(f"give either {axis} or d{axis}")
         turns = (self.rpy, self.drpy, self.quaternion)
+        given = any(each is not None for each in (self.x, self.y, self.z, self.dx, self.dy, self.dz, *turns))
+        if self.pose is not None:
+            if given or self.frame or "path" in self.model_fields_set:
+                raise ValueError("give the name of a pose, or its coordinates")
+            return self
         if sum(each is not None for each in turns) > 1:
             raise ValueError("give only one of rpy, drpy and quaternion")
-        if all(each is None for each in (self.x, self.y, self.z, self.dx, self.dy, self.dz, *turns)):
+        if not given:
             raise ValueError("give a coordinate or an orientation, such as dz=5cm")
         if self.quaternion is not None and abs(math.hypot(*self.quaternion) - 1) > NORM:
             raise ValueError(
@@ -104,9 +112,10 @@ class PoseCommand(CommandModel):
             )
         return self
 
-    @property
-    def as_goal(self) -> PoseGoal:
-        """The pose for the loop."""
+    def as_goal(self, joints: Sequence[str] = ()) -> PoseGoal:
+        """Return the pose for the loop; raise ValueError if a pose by name lacks one of the joints."""
+        if self.pose is not None and (lacking := [each for each in joints if each not in self.pose]):
+            raise ValueError(f"the pose has no position of {', '.join(lacking)}")
         x, y, z = (math.nan if each is None else each for each in (self.x, self.y, self.z))
         rotation = None if self.rpy is None else from_rpy(self.rpy)
         if self.quaternion is not None:
@@ -118,9 +127,10 @@ class PoseCommand(CommandModel):
             (self.dx or 0.0, self.dy or 0.0, self.dz or 0.0),
             rotation,
             from_rpy(self.drpy or (0.0, 0.0, 0.0)),
-            self.path == "line",
+            self.path == "line" and self.pose is None,
             math.nan if self.seconds is None else self.seconds,
             self.frame,
+            tuple(self.pose[joint] for joint in joints) if self.pose else (),
         )
 
 
@@ -138,9 +148,8 @@ class TwistCommand(CommandModel):
     frame: _Frame = ""
     """Link whose axes are meant; those of the tip turn with it. Empty: the base of the controller"""
 
-    @property
-    def as_goal(self) -> TwistGoal:
-        """The twist for the loop."""
+    def as_goal(self, joints: Sequence[str] = ()) -> TwistGoal:
+        """Return the twist for the loop."""
         return TwistGoal((self.vx, self.vy, self.vz), (self.wx, self.wy, self.wz), self.frame)
 
 
@@ -154,11 +163,13 @@ class PoseGoal(msgspec.Struct, frozen=True, array_like=True):
     by_line: bool
     seconds: float
     frame: str
+    positions: tuple[float, ...]
+    """Positions of the joints, rad or m; empty: by the coordinates."""
 
     @property
     def asks_orientation(self) -> bool:
         """True if the goal has an orientation, absolute or relative."""
-        return self.rotation is not None or self.turn[3] != 1.0
+        return bool(self.positions) or self.rotation is not None or self.turn[3] != 1.0
 
     def target(self, frame: Pose, tip: Pose) -> Pose:
         """Return the goal pose in the base from the poses of the frame and of the tip at the start."""

@@ -30,12 +30,14 @@ class SpaceRobot(RemoteRobot):
     with connect() as robot:
         robot.move_to(x=0.2, y=0.0, z=0.15)
         robot.move_to(dz="5 cm", seconds=2.0)
+        robot.move_to(pose="above")
     """
 
     def move_to(
         self,
         arm: str = "",
         *,
+        pose: str | None = None,
         x: Distance = None,
         y: Distance = None,
         z: Distance = None,
@@ -46,7 +48,7 @@ class SpaceRobot(RemoteRobot):
         drpy: Angles = None,
         quaternion: Sequence[float] | None = None,
         frame: str = "",
-        path: Literal["line", "joints"] = "line",
+        path: Literal["line", "joints"] | None = None,
         seconds: float | None = None,
         timeout: float | None = None,
     ) -> GoalState:
@@ -54,6 +56,7 @@ class SpaceRobot(RemoteRobot):
 
         Args:
             arm: Name of the `cartesian_controller`; empty: the only one.
+            pose: Name of a pose of the robot file, in place of coordinates.
             x, y, z, dx, dy, dz, rpy, drpy, quaternion, frame, path, seconds: Fields of its command `pose`.
             timeout: Longest wait, s; None waits without limit.
 
@@ -63,15 +66,15 @@ class SpaceRobot(RemoteRobot):
             DxlrunError: There is no such arm, or the robot is gone.
         """
         fields = {
-            "x": x, "y": y, "z": z, "dx": dx, "dy": dy, "dz": dz, "rpy": rpy, "drpy": drpy,
+            "pose": pose, "x": x, "y": y, "z": z, "dx": dx, "dy": dy, "dz": dz, "rpy": rpy, "drpy": drpy,
             "quaternion": quaternion, "frame": frame, "path": path, "seconds": seconds,
         }  # fmt: skip
-        pose = {name: value for name, value in fields.items() if value is not None}
+        given = {name: value for name, value in fields.items() if value is not None}
         arms = self._arms()
         if arm not in arms and (arm or len(arms) != 1):
             raise DxlrunError(f"{self.name} has {len(arms)} arms ({', '.join(arms)}); name one")
         try:
-            (goal,) = self.send(arm or arms[0], "pose", pose).goals
+            (goal,) = self.send(arm or arms[0], "pose", given).goals
         except Refused as refused:
             raise PoseRefused(str(refused), code=refused.code, fields=refused.fields) from None
         state = goal.wait(timeout)

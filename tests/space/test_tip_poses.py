@@ -105,6 +105,9 @@ def test_move_to_waits_for_the_pose_and_raises_what_refused_it(monkeypatch: pyte
         assert robot.states().position.tolist() == pytest.approx(before, abs=2e-3)
         assert robot.move_to(x=0.2, y=0, z=0.15, quaternion=(0, 0.5, 0, 0.866)).reached
         assert robot.move_to(dz=-0.03, seconds=2.0).seconds == pytest.approx(2.0, abs=0.3)
+        named = robot.link.gateways_link.plan.poses["above"]
+        assert robot.move_to(pose="above").reached
+        assert robot.states().position[:4] == pytest.approx([*named.values()], abs=5e-3)
         for x, frame, text in (
             (math.nan, "", "nan"),
             ("3deg", "", "3deg"),

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, ClassVar, TypeAlias
 
 import msgspec
+
+from dxlrun.errors import suggestion
 
 # Only names of types: a monitor in the same module brings this one into the loop's process.
 if TYPE_CHECKING:
@@ -23,7 +25,22 @@ if TYPE_CHECKING:
 
 
 Poses: TypeAlias = "Mapping[str, Mapping[str, Measure]]"
-"""Positions of joints by the name of the pose."""
+"""Positions of joints by the name of the pose; empty: the pose needs a joint that the run omits."""
+
+
+def unknown_pose(
+    name: str, poses: Mapping[str, Mapping[str, float]], omitted: Sequence[str]
+) -> tuple[str, str]:
+    """Return problem and fix for the name of a pose that is not in `poses`, or empty there.
+
+    `omitted` are the joints and groups that the run omits.
+    """
+    if name in poses:
+        joints = ", ".join(omitted)
+        return f"pose {name} needs a joint that is omitted ({joints})", f"run with {joints}"
+    known = [each for each, positions in poses.items() if positions]
+    fix = suggestion(name, known) if known else "add it to `poses` of the robot file"
+    return f"the robot has no pose {name}", fix
 
 
 class Compilation(msgspec.Struct, frozen=True):
@@ -74,7 +91,8 @@ class Contribution(msgspec.Struct, frozen=True):
     recording: RecordingPlan | None = None
     """Folder and settings of the log; only one feature may set it."""
     poses: Mapping[str, Mapping[str, float]] = {}
-    """Positions of joints, rad or m, by the names by which policies, motions and keyframes use them."""
+    """Positions of joints, rad or m, by the names by which policies, motions and keyframes use them; empty: a
+    joint of the pose is omitted."""
     policies: Mapping[str, str] = {}
     """Texts for `dxlrun check` that say what the feature's policies do, by `policy` or `policy of group`."""
 

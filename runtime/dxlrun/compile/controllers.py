@@ -10,7 +10,7 @@ from msgspec.structs import replace
 from pydantic import ValidationError
 
 from dxlrun.channels.cycle import MOST_CONTROLLERS
-from dxlrun.compile.contribution import Contribution, Poses
+from dxlrun.compile.contribution import Contribution, Poses, unknown_pose
 from dxlrun.compile.controller_entry import (
     CompiledController,
     WrongEntry,
@@ -87,9 +87,13 @@ def compile_controllers(
     compiled: dict[str, CompiledController] = {}
     plans: list[ControllerPlan] = []
     for name, written in file.robot.controllers.items():
-        entry = written.model_copy(update={"parameters": _with_poses(written.parameters, poses)})
+        lacking: list[tuple[KeyPath, str]] = []
+        parameters = _with_poses(written.parameters, poses, ("controllers", name), lacking)
+        entry = written.model_copy(update={"parameters": parameters})
         plan = plan_entry(name, entry, _every(file, name, entry.rate))
-        one = _compiled(file, plan, plugins, entry)
+        for path, pose in lacking:
+            file.error(file.at(*path), *unknown_pose(pose, poses, file.description.omitted))
+        one = None if lacking else _compiled(file, plan, plugins, entry)
         if one is not None:
             compiled[name] = one
         plans.append(plan if one is None else one.plan)
@@ -108,14 +112,19 @@ def compile_controllers(
     return compiled
 
 
-def _with_poses(value: object, poses: Poses) -> object:
-    """Return parameters with the positions of a pose in place of its name at each key `pose`."""
+def _with_poses(value: object, poses: Poses, path: KeyPath, lacking: list[tuple[KeyPath, str]]) -> object:
+    """Return parameters with the positions of a pose in place of its name at each key `pose`.
+
+    Names of poses that need an omitted joint are added to `lacking`, with their paths.
+    """
     if isinstance(value, list):
-        return [_with_poses(item, poses) for item in value]
+        return [_with_poses(item, poses, (*path, index), lacking) for index, item in enumerate(value)]
     if not isinstance(value, dict):
         return value
-    found = {key: _with_poses(item, poses) for key, item in value.items()}
+    found = {key: _with_poses(item, poses, (*path, key), lacking) for key, item in value.items()}
     if isinstance(name := found.get("pose"), str) and name in poses:
+        if not poses[name]:
+            lacking.append(((*path, "pose"), name))
         found["pose"] = {joint: f"{float(at)!r} {at.unit}" for joint, at in poses[name].items()}
     return found
 

@@ -24,6 +24,7 @@ import numpy as np
 from msgspec import structs
 from pydantic import ValidationError
 
+from dxlrun.compile.contribution import unknown_pose
 from dxlrun.compile.controller_entry import CompiledController
 from dxlrun.compile.joints.compiled_joints import CompiledJoint
 from dxlrun.compile.joints.limits import check_samples
@@ -93,7 +94,8 @@ def compile_motions(
         if isinstance(found, MotionDescription):
             played.append(found)
             try:
-                found = with_poses(found, poses, {name: joint.plan for name, joint in joints.items()})
+                plans = {name: joint.plan for name, joint in joints.items()}
+                found = with_poses(found, poses, plans, file.description.omitted)
             except InputError as error:
                 file.extend(error.problems)
                 continue
@@ -104,18 +106,23 @@ def compile_motions(
 
 
 def with_poses(
-    motion: MotionDescription, poses: Mapping[str, Mapping[str, float]], joints: Mapping[str, JointPlan]
+    motion: MotionDescription,
+    poses: Mapping[str, Mapping[str, float]],
+    joints: Mapping[str, JointPlan],
+    omitted: Sequence[str],
 ) -> MotionDescription:
-    """Return a motion whose points have the joints of the poses that they name; raise InputError."""
+    """Return a motion whose points have the joints of the poses that they name; raise InputError.
+
+    `omitted` are the joints and groups that the run omits.
+    """
     problems = Problems()
 
     def posed(point: Point, number: int, index: int) -> Point:
         if point.pose is None:
             return point
-        if point.pose not in poses:
+        if not poses.get(point.pose):
             mark = motion.marks.value("motions", index, "points", number, "pose")
-            fix = suggestion(point.pose, tuple(poses)) if poses else "add it to poses of the robot file"
-            problems.error(mark, f"the robot has no pose {point.pose}", fix)
+            problems.error(mark, *unknown_pose(point.pose, poses, omitted))
         targets = {
             joint: Target(position=Measure(position, joints[joint].unit.si))
             for joint, position in poses.get(point.pose, {}).items()

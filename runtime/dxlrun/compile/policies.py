@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 
-from dxlrun.compile.contribution import Contribution, Poses
+from dxlrun.compile.contribution import Contribution, Poses, unknown_pose
 from dxlrun.compile.joints.compiled_joints import CompiledJoint
 from dxlrun.compile.joints.limits import Interval, degrees, limits_of
 from dxlrun.compile.problems import RobotFile
@@ -38,7 +38,8 @@ def compile_poses(
 ) -> Poses:
     """Return all poses: those of the section `poses`, checked, and those of features, by section."""
     _check_poses(file, joints)
-    poses: dict[str, Mapping[str, Measure]] = dict(file.robot.poses)
+    poses: dict[str, Mapping[str, Measure]] = {name: {} for name in file.description.omitted_poses}
+    poses |= file.robot.poses
     for section, contribution in contributions.items():
         for name, positions in contribution.poses.items():
             if name in poses:
@@ -116,11 +117,8 @@ def _policy(
         elif isinstance(step, PoseStep):
             mark_path = ("policies", name, index, "pose")
             angles = poses.get(step.pose)
-            if angles is None:
-                mark = file.at(*mark_path)
-                known = tuple(poses)
-                what = f"pose {step.pose} of {name} is not defined"
-                file.error(mark, what, suggestion(step.pose, known) if known else "add it to poses")
+            if not angles:
+                file.error(file.at(*mark_path), *unknown_pose(step.pose, poses, file.description.omitted))
             else:
                 linear = [joint for joint in angles if joint in joints and joints[joint].plan.unit is LINEAR]
                 if linear and step.linear_speed is None:

@@ -36,6 +36,8 @@ class Description(msgspec.Struct, frozen=True):
     """Warnings of reading, such as what is omitted together with a joint."""
     uneven: tuple[KeyPath, ...] = ()
     """Lists of controllers that may have a value for a joint that is omitted."""
+    omitted_poses: tuple[str, ...] = ()
+    """Poses that are omitted because all their joints are."""
 
     @property
     def groups(self) -> dict[str, tuple[str, ...]]:
@@ -107,6 +109,7 @@ def _read_robot(
         omitted.names,
         omitted.remarks,
         omitted.uneven,
+        omitted.poses,
     )
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 
 import msgspec
@@ -17,6 +17,7 @@ from msgspec.structs import replace
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from dxlrun.channels.answers import Code, Field, Refusal
+from dxlrun.compile.contribution import unknown_pose
 from dxlrun.compile.controller_entry import (
     CompiledController,
     WrongEntry,
@@ -198,6 +199,8 @@ class Preparation:
     """Names of groups of joints in the robot file, with their joints."""
     omitted: tuple[str, ...] = ()
     """Joints of the robot file that the run omits."""
+    poses: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    """Poses of the robot, as `Plan.poses`."""
     _known: dict[str, ResolvedController] = field(default_factory=dict, init=False)
     """Cache of `known`, by controller name; not used when a controller of that name has another plan now."""
     _schemas: dict[str, dict[str, object]] = field(default_factory=dict, init=False)
@@ -288,6 +291,8 @@ class Preparation:
         what = f"{kind} of {plan.name}"
         if units and _of_motions(kind, model):
             body = in_si(body, what, known.joints)
+        if "pose" in model.model_fields:
+            body = self._with_pose(body, what)
         with plugin_code(plan.name, what, model):
             command = model.model_validate_json(body, strict=True)
             prepared = controller.prepare(kind, command, known.parameters)
@@ -297,6 +302,16 @@ class Preparation:
             peaks = controller.speed_peaks(kind, np.frombuffer(data, "<f8"), known.parameters)
             beyond = tuple(beyond_limits(known.joints, command, peaks))
         return PreparedCommand(plan.name, kind, data, beyond, body)
+
+    def _with_pose(self, body: bytes, what: str) -> bytes:
+        """Return a command with the positions of a pose in place of its name at the key `pose`."""
+        with suppress(msgspec.MsgspecError, RecursionError):  # refused with the other mistakes
+            written = msgspec.json.decode(body)
+            if isinstance(written, dict) and isinstance(name := written.get("pose"), str):
+                if not (positions := self.poses.get(name)):
+                    raise invalid("{}: {}; {}".format(what, *unknown_pose(name, self.poses, self.omitted)))
+                return msgspec.json.encode({**written, "pose": positions})
+        return body
 
     def parse_controller(self, plan: ControllerPlan) -> ResolvedController:
         """Return a controller's class, parsed parameters and joints, from the cache if the plan is the same.

@@ -73,7 +73,9 @@ def main() -> None:
         link = Link(plan, job.memory, job.epoch_offset_ns)
         joints = {joint.name: joint for joint in plan.loop.joints}
         plugins = load_plugins(files=plan.included)
-        preparation = Preparation(joints, plugins, plan.loop.sources, plan.urdf, plan.groups, plan.omitted)
+        preparation = Preparation(
+            joints, plugins, plan.loop.sources, plan.urdf, plan.groups, plan.omitted, plan.poses
+        )
         gateway = GatewayApp(link, preparation, job.log)
         network = Listener.secured(Address.parse(job.listen, plan.robot)) if job.listen else None
         listener, path = create_listener(plan.robot)

@@ -86,8 +86,9 @@ class VirtualLink:
         for descriptor in astuple(memory):
             os.close(descriptor)
         joints = {joint.name: joint for joint in loop.joints}
+        plugins = load_plugins(files=plan.included)
         preparation = Preparation(
-            joints, load_plugins(files=plan.included), loop.sources, plan.urdf, plan.groups, plan.omitted
+            joints, plugins, loop.sources, plan.urdf, plan.groups, plan.omitted, plan.poses
         )
         log_path = str(log) if log else None
         # One second per request, so that no rate limit applies.

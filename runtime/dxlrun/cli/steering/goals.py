@@ -40,8 +40,8 @@ def send(
     """Send a command to a controller or a device: `dxlrun send arm position elbow=20deg wrist=0deg`.
 
     A pose names joints or groups. All other joints keep their goals. Other commands of a controller have
-    keys: `dxlrun send base velocity 'linear=0.1 m/s'`. `dxlrun list` shows the commands of each controller. A
-    device has no command names: `dxlrun send board led=1`.
+    keys: `dxlrun send base velocity 'linear=0.1 m/s'`. `dxlrun list` shows the commands of each controller.
+    `dxlrun send arm pose above` names a pose. A device has no command names: `dxlrun send board led=1`.
 
     Parameters
     ----------
@@ -68,6 +68,8 @@ def send(
     for_device = "=" in kind
     if for_device:
         words, kind = (kind, *words), SOURCE_COMMANDS
+    elif kind == "pose" and words and "=" not in words[0]:
+        words = (f"pose={words[0]}", *words[1:])
     written = WrittenEntry.from_words(words, file)
     try:
         seconds = None if in_ is None else duration(in_, bare="s") * 1e-9

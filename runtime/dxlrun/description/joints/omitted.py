@@ -42,6 +42,8 @@ class Omission(msgspec.Struct, frozen=True):
     """A warning that names the joints, what is omitted with them, and what is without them."""
     uneven: tuple[KeyPath, ...] = ()
     """Lists of controllers that may have one value for each joint, also for those omitted."""
+    poses: tuple[str, ...] = ()
+    """Poses that are omitted because all their joints are."""
 
 
 def omit_joints(grown: PlainDocument, without: Sequence[str]) -> Omission:
@@ -82,6 +84,7 @@ def omit_joints(grown: PlainDocument, without: Sequence[str]) -> Omission:
         (*out, *(name for name in groups if name not in left)),
         (remark,),
         tuple(at for at in remover.uneven if str(at[1]) in _mapping(reduced.data.get(_CONTROLLERS))),
+        tuple(remover.poses),
     )
 
 
@@ -109,7 +112,7 @@ class _Remover:
     def __init__(self, out: Collection[str], joints: Collection[str]) -> None:
         self._out, self._joints = frozenset(out), joints
         self._places: dict[KeyPath, KeyPath] = {}
-        self._poses: frozenset[str] = frozenset()
+        self.poses: frozenset[str] = frozenset()
         self.gone: list[str] = []
         """Entries of sections that are omitted with the joints, such as `controller gripper`."""
         self.changed: list[str] = []
@@ -119,7 +122,7 @@ class _Remover:
 
     def reduced(self, grown: PlainDocument) -> PlainDocument:
         """Return the document without the joints."""
-        self._poses = frozenset(
+        self.poses = frozenset(
             name
             for name, pose in _mapping(grown.data.get(_POSES)).items()
             if _mapping(pose) and self._out.issuperset(_mapping(pose))
@@ -197,7 +200,7 @@ class _Remover:
         for index, item in enumerate(value):
             if isinstance(item, str) and item in self._out and path[-1] in _LISTS:
                 continue
-            if path[:1] == (_POLICIES,) and self._poses.intersection(_list(_mapping(item).get("pose"))):
+            if path[:1] == (_POLICIES,) and self.poses.intersection(_list(_mapping(item).get("pose"))):
                 continue
             kept = self._value(item, (*path, index), (*place, len(result)))
             if kept is not None or item is None:
