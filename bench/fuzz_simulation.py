@@ -7,7 +7,7 @@ and judged by code of this file.
 
     python bench/fuzz_simulation.py 1000000
 
-CI runs a seeded sample of it (tests/dxlsim/test_fuzz.py).
+CI runs a seeded sample of it (tests/dxlsim/test_packets.py).
 """
 
 from __future__ import annotations

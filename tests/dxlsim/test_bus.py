@@ -334,15 +334,6 @@ def test_an_unplugged_adapter_loses_what_was_on_its_way():
     ]
 
 
-def test_an_unplugged_adapter_loses_the_rest_of_a_burst():
-    bus = new_bus(AdapterConfig(latency_timer_ns=MS, split="byte"))
-    bus.receive_bytes(PING_1, 0)
-    assert handed_over(bus, MS) == [(MS, PONG_1[:1])]
-    bus.unplug()
-    bus.plug_in()
-    assert handed_over(bus) == []
-
-
 # Its ports on virtual time
 
 
