@@ -8,7 +8,6 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-import rustypot
 import serial
 from dynamixel_sdk import COMM_SUCCESS, GroupSyncRead, GroupSyncWrite
 from tests.foreign.conftest import Item
@@ -65,26 +64,7 @@ def test_an_echo_passes_for_an_answer_in_protocol_1(connect: Any) -> None:
     host = connect("echo 1", 1.0)
     _, result, error = host.sdk.txRxPacket(host.port, [0, 0, 1, 2, 1, 0])
     assert (result, error) == (COMM_SUCCESS, 1)  # the instruction byte, taken for a voltage error
-    assert host.sdk.rxPacket(host.port)[0] == [
-        0xFF,
-        0xFF,
-        1,
-        2,
-        0,
-        0xFC,
-    ]  # what the servo said
-
-
-@without_echo
-def test_rustypot_reads_and_writes_in_both_protocols(simulation: Any, kind: str) -> None:
-    x_bus = rustypot.Xl430PyController(simulation.ports[f"{kind} 2"], RATE, DEADLINE_S)
-    assert x_bus.sync_read_register(list(range(1, 7)), "model_number") == [1020] * 6
-    assert x_bus.write_register_with_error(1, "led", 1) == 0
-    x_bus.close()
-    mx_bus = rustypot.MxPyController(simulation.ports[f"{kind} 1"], RATE, DEADLINE_S)
-    assert mx_bus.read_register_with_error(2, "model_number") == (29, 0)
-    assert mx_bus.write_register_with_error(2, "led", 1) == 0
-    mx_bus.close()
+    assert host.sdk.rxPacket(host.port)[0] == list(b"\xff\xff\1\2\0\xfc")  # what the servo said
 
 
 @pytest.mark.parametrize(("bus", "ids"), [("silent", [1]), ("slot", [1, 2])])

@@ -17,7 +17,6 @@ from dynamixel_easy_sdk import (
     connector,
 )
 from tests.foreign.conftest import PatientPort
-from tests.kit.awaited import until
 
 from dxlsim.simulation_plan import BusConfig, ServoConfig
 from dxlwire.control_table import all_tables, find_table
@@ -33,9 +32,7 @@ POSITION = 1.0
 """rad, of every servo at the start: also a gripper reaches it."""
 LINES = {
     "models": MODELS,
-    "modes": ["XM430-W350"],
     "settings": ["XM430-W350"],
-    "group": ["XM430-W350"] * 2,
 }
 BUSES = [
     BusConfig(name, 1_000_000, tuple(ServoConfig(n, each, POSITION) for n, each in enumerate(models, 1)), 2.0)
@@ -71,22 +68,6 @@ def test_it_finds_every_model_and_reads_it_by_its_own_table(connect: Any) -> Non
         assert abs(motor.getPresentPosition() * table.rad_per_tick - POSITION) < 0.01, model
 
 
-def test_a_motor_moves_in_position_and_velocity_mode(connect: Any) -> None:
-    motor = connect("modes").createMotor(1)
-    motor.enableTorque()
-    goal = motor.getPresentPosition() + 150
-    motor.setGoalPosition(goal)
-    assert until(lambda: abs(motor.getPresentPosition() - goal) < 20)
-    motor.disableTorque()
-    motor.setOperatingMode(OperatingMode.VELOCITY)
-    motor.enableTorque()
-    for sign in (1, -1):
-        motor.setGoalVelocity(60 * sign)
-        assert until(lambda sign=sign: motor.getPresentVelocity() * sign > 40)
-    motor.disableTorque()
-    assert until(lambda: motor.getPresentVelocity() == 0)
-
-
 def test_settings_are_kept_and_limits_hold(connect: Any, simulation: Any) -> None:
     motor = connect("settings").createMotor(1)
     before = motor.getPresentPosition()
@@ -105,26 +86,3 @@ def test_settings_are_kept_and_limits_hold(connect: Any, simulation: Any) -> Non
     with pytest.raises(DxlRuntimeError, match="limit") as refused:
         motor.setGoalPosition(1000)
     assert refused.value.dxl_error == DxlError.SDK_ERRNUM_DATA_LIMIT
-
-
-def test_a_group_reads_and_writes_by_sync_and_by_bulk(connect: Any) -> None:
-    bus = connect("group")
-    one, other = (bus.createMotor(each) for each in (1, 2))
-    group = bus.createGroupExecutor()
-    for motor in (one, other):
-        group.addCmd(motor.stageEnableTorque())
-    group.executeWrite()
-    assert [one.isTorqueOn(), other.isTorqueOn()] == [1, 1]
-    group.clearStagedWriteCommands()
-    for command in (one.stageSetGoalPosition(800), other.stageLEDOn()):
-        group.addCmd(command)
-    group.executeWrite()
-    for command in (one.stageGetPresentPosition(), other.stageIsLEDOn()):
-        group.addCmd(command)
-
-    def arrived() -> bool:
-        position, led = group.executeRead()
-        assert led == 1
-        return abs(position - 800) < 20
-
-    assert until(arrived)

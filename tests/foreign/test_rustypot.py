@@ -36,7 +36,6 @@ BUSES = (
         for use in ("read", "drive")
     ),
     line("moved", 2.0, "XL430-W250", "XL330-M288"),
-    line("many", 2.0, *["XL330-M288"] * 8),
     line("stuffed", 2.0, "XL330-M288"),
 )
 every = pytest.mark.parametrize("kind", MODELS)
@@ -97,15 +96,6 @@ def test_two_servos_are_found_and_driven_by_a_sync_write(connect: Any, simulatio
         return all(abs(have - want) <= 10 for have, want in zip(present, goals, strict=True))
 
     assert until(arrived)
-
-
-def test_a_fast_sync_read_of_eight_servos_tells_what_a_sync_read_does(connect: Any) -> None:
-    bus, ids = connect("many", "Xl330"), list(range(1, 9))
-    slow = bus.sync_read_raw_data(ids, 132, 4)
-    bus.set_fast_sync_read(True)
-    fast = bus.sync_read_raw_data(ids, 132, 4)
-    assert [list(each) for each in fast] == [list(each) for each in slow]
-    assert all(abs(int.from_bytes(bytes(each), "little") - 1304) <= 1 for each in fast)
 
 
 def test_data_that_look_like_a_header_arrive_as_they_were_meant(connect: Any) -> None:

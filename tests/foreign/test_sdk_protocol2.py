@@ -90,18 +90,6 @@ def test_sync_read_and_sync_write_move_two_servos(connect: Any) -> None:
     assert until(arrived)
 
 
-def test_fast_sync_read_tells_the_same_as_sync_read(connect: Any) -> None:
-    host = connect("sync")
-    reading = GroupSyncRead(host.port, host.sdk, 36, 4)  # PWM Limit, Velocity Limit... constant of the EEPROM
-    assert all(reading.addParam(each) for each in (1, 2))
-    found = []
-    for ask in (reading.txRxPacket, reading.fastSyncRead):
-        assert ask() == COMM_SUCCESS
-        found.append([reading.getData(each, 36, 4) for each in (1, 2)])
-    assert found[0] == found[1]
-    assert found[0][0] & 0xFFFF == 885  # e-Manual, PWM Limit (36)
-
-
 def test_bulk_read_and_bulk_write_of_different_items(connect: Any) -> None:
     host = connect("bulk")
     writing = GroupBulkWrite(host.port, host.sdk)

@@ -311,20 +311,6 @@ def test_torque_comes_back_within_limits_only_and_if_servos_agree(plan, monkeypa
         assert 1 not in torque(robot, servo, 200_000_000)
 
 
-def test_torque_off_at_one_joint_of_a_wrist_takes_the_controllers_of_both(plan, tmp_path):
-    hands = (
-        "pitch, roll]}",
-        "]}\n  up: {type: joint_group_position_controller, joints: [pitch]}\n"
-        "  around: {type: joint_group_position_controller, joints: [roll]}",
-    )
-    robot = VirtualRobot(plan((", " + hands[0], hands[1])), log=tmp_path / "run.mcap")
-    ask_torque(robot, "roll", (400, "false"))
-    robot.run()
-    assert isinstance(robot.inbox.answers[1], Completion)
-    active = read_log(tmp_path / "run.mcap").cycles["active"]  # bits: states, all, up, around
-    assert (int(active[10]), int(active[-1])) == (0b1111, 0b0011)
-
-
 @pytest.mark.parametrize(("pitch", "roll"), [(0, 0), (38, -57), (-38, 58), (30, 50)])
 def test_servos_of_a_transmission_may_cross_raw_0(tmp_path, pitch, roll):
     run = SampledRun(tmp_path, CROSSING, 4.0)

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from dynamixel_sdk import COMM_RX_TIMEOUT, COMM_SUCCESS, PacketHandler, PortHandler
+from dynamixel_sdk import COMM_RX_TIMEOUT, COMM_SUCCESS, PacketHandler
 from msgspec.structs import replace
+from tests.foreign.conftest import PatientPort
 from tests.kit.campaigns import campaign
 from tests.kit.line_faults import corrupt_next, truncate_next
 from tests.kit.packets import packet1, packet2
@@ -195,11 +196,11 @@ def test_the_makers_sdk_reads_registers_of_a_recorded_bus(run, kind, tmp_path):
     protocol, model = float(kind), {"1.0": 12, "2.0": 1060}[kind]
     bus = BusConfig("main", 1_000_000, (), protocol, recorded=str(run(kind).path))
     with SimulatedServos((bus,), -1, tmp_path / "ledger.jsonl") as served:
-        port, packets = PortHandler(served.ports[0]), PacketHandler(protocol)
-        assert port.openPort()
+        port, packets = PatientPort(served.ports[0]), PacketHandler(protocol)
         assert port.setBaudRate(1_000_000)
         assert packets.ping(port, 1) == (model, COMM_SUCCESS, 0)
         assert packets.read2ByteTxRx(port, 2, 0) == (model, COMM_SUCCESS, 0)
+        port.patience_ms = 30.0
         assert packets.ping(port, 5)[1] == COMM_RX_TIMEOUT
         port.closePort()
 
