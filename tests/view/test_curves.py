@@ -4,10 +4,16 @@ from __future__ import annotations
 
 import math
 
+import msgspec
 import numpy as np
 import pytest
+from tests.kit.torso import ROBOTS
 
+from dxlrun import RemoteRobot
+from dxlrun.testing import plan_of
+from dxlrun.tooling.runs import VirtualLink
 from dxlrun_view.curves import History, numbers_in, thinned
+from dxlrun_view.live_robot import LiveRobot
 
 
 def test_memory_holds_the_newest_moments_and_no_more() -> None:
@@ -58,3 +64,12 @@ def test_numbers_of_a_message_are_named() -> None:
     }
     assert numbers_in({"long": np.zeros(1000)}, "") == {}
     assert math.isnan(numbers_in({"x": math.nan}, "")["x"])
+
+
+def test_curves_start_again_with_a_run_whose_clock_is_earlier() -> None:
+    with RemoteRobot("t", VirtualLink(plan_of(ROBOTS / "single_joint.yaml", duration_s=1.0))) as robot:
+        states = robot.states()
+    live, began_ns = LiveRobot("t"), 10**10
+    for cycle, late_ns in enumerate((20, 40, 0)):
+        live._note_cycle(msgspec.structs.replace(states, cycle=cycle, time_ns=began_ns + late_ns * 10**6))
+    assert live.curve("loop/cycle", 0.0, 99.0, 9).value == [2.0]
