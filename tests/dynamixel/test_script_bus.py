@@ -321,6 +321,23 @@ def test_set_of_servos_is_a_mapping_of_ids_and_takes_numbers_of_numpy(script):
         servos.reader("led", "led")
 
 
+def test_states_belong_to_the_caller(script):
+    servos = script.bus.scan()
+    read, first = servos.reader("present_position"), servos.reader("led", "present_position")()
+    before = read()
+    kept = before.position.copy()
+    script.simulated.servos[1].turn_shaft(0.5, 1)
+    script.simulated.servos[2].trigger_overload()
+    script.let_pass(0.2)
+    after = read()
+    assert before.position.tolist() == first.position.tolist() == kept.tolist() != after.position.tolist()
+    assert (before.alert.any(), after.alert.tolist()) == (False, [False, False, True])
+    for array in (after.position, after.valid, after.alert):
+        array[:] = 0
+    assert (read().position > 0).all()
+    assert (read().valid.all(), read().alert.tolist()) == (True, [False, False, True])
+
+
 def test_states_are_copied_and_errors_pickled(script):
     state = copy.deepcopy(script.bus.scan().reader("present_position")())
     assert (state.position.shape, state.valid.all()) == ((3,), True)
@@ -549,6 +566,9 @@ def test_without_the_kernel_the_sdk_does_the_same(monkeypatch, servos, protocol)
                 before.position[:2] + np.array([0.1, 0]), abs=0.01
             )
             assert state.goal_position[2] == pytest.approx(0 if protocol == 1.0 else before.position[2])
+            found.writer("goal_position", "led")(before.position, [np.nan, 1, 1])
+            assert found.read("led").tolist() == [0, 1, 1]
+            assert read().goal_position[0] == state.goal_position[0]
             served.inject("silence servo=2")
             state = read()
             assert state.valid.tolist() == [True, False, True]

@@ -65,6 +65,7 @@ class Reading(ReadRows):
     ) -> None:
         super().__init__(session, servos, items)
         self.session = session
+        self._recording = session.log.recording
         plan = _read_plan(session, servos, items, raw)
         self._samples = Samples([plan], _Joints(), self._arrays, _NoReports())
         self.reads = CyclicReads(plan, self._samples.buses[0], session.engine.owed)
@@ -90,7 +91,8 @@ class Reading(ReadRows):
             finally:
                 self.end_cycle()  # Also after a KeyboardInterrupt
             session.check_open()
-        session.log.commit_packets()
+        if self._recording is not None:
+            self._recording.commit_packets()
 
     def begin_cycle(self, *, kernel: bool = True) -> bool:
         """Read by the kernel if it can; otherwise load the reads for `Lines.pump`, and return True."""
@@ -123,7 +125,7 @@ class Reading(ReadRows):
             arrived = self._samples.buses[0].arrived(member)
             reads.missed[member] = 0 if arrived else reads.missed[member] + 1
         # The kernel accepts no other error byte than the one that the parser has read.
-        self._alert.fill(False)
+        self._alert = np.zeros_like(self._alert)
         for one, error in zip(self._members, reads.errors, strict=True):
             self._alert[one.device] |= bool(error & self._alert_bits)
         reads.end_cycle()
@@ -139,6 +141,7 @@ class Writing(WrittenRows):
     ) -> None:
         super().__init__(session, servos, items)
         self._session = session
+        self._recording = session.log.recording
         samples = Samples([session.plan], _Joints(), ServoRows(np.empty(0), *_empty()), _NoReports())
         self._writes = _Writes(_sync_writes(session, servos, items, raw))
         self._kernel = _kernel(session, session.plan, samples, self._writes, self._goals)
@@ -152,7 +155,8 @@ class Writing(WrittenRows):
             for failure in self._kernel.finish_write(code).values():
                 session.engine.mark_lost(failure)
             session.check_open()
-        session.log.commit_packets()
+        if self._recording is not None:
+            self._recording.commit_packets()
 
 
 def _empty() -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
@@ -213,7 +217,7 @@ def _sync_writes(
     return tuple(
         SyncWrite(
             layout,
-            items.index(names[0]),
+            0,  # Half of a servo's items would be sent with zeros or old values for the rest
             tuple(part),
             tuple(part),
             tuple(servos[row].servo_id for row in part),
@@ -221,6 +225,7 @@ def _sync_writes(
                 [_cell(item_of(servos[row].table, name), layout, items.index(name), raw) for name in names]
                 for row in part
             ),
+            leads=len(items),
             always=True,
         )
         for (layout, names), rows in groups.items()

@@ -36,6 +36,7 @@ class SdkReading(ReadRows):
 
     def _read_all(self) -> Program[bool]:
         arrays, now_ns = self._arrays, self._session.clock.now_ns
+        self._alert = self._alert.copy()
         for row, (servo_id, blocks) in enumerate(zip(self.ids, self._blocks, strict=True)):
             found: list[tuple[int, float]] = []
             first_ns, error = now_ns(), 0
@@ -70,7 +71,7 @@ class SdkWriting(WrittenRows):
         super().__init__(session, servos, items)
         self._session = session
         self._raw = raw
-        self._rows = {name: row for row, name in enumerate(items)}
+        self._row_of = dict(zip(items, self._rows, strict=True))
         self._ids = [servo.servo_id for servo in servos]
         self._blocks = [side_by_side(writable_item(servo, name) for name in items) for servo in servos]
 
@@ -82,7 +83,7 @@ class SdkWriting(WrittenRows):
         writes = [
             (servo_id, block[0].address, b"".join(self._encoded(item, column) for item in block))
             for column, (servo_id, blocks) in enumerate(zip(self._ids, self._blocks, strict=True))
-            if not np.isnan(self._goals[0, column])
+            if not any(np.isnan(row[column]) for row in self._rows)
             for block in blocks
         ]
         for packet in sync_writes(self._session.line.dialect, writes):
@@ -90,5 +91,5 @@ class SdkWriting(WrittenRows):
         return True
 
     def _encoded(self, item: ControlItem, column: int) -> bytes:
-        goal = float(self._goals[self._rows[item.name], column])
+        goal = float(self._row_of[item.name][column])
         return item.encode(nearest_ticks(item, goal, raw=self._raw))

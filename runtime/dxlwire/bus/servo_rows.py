@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import msgspec
 import numpy as np
@@ -17,43 +16,38 @@ from dxlwire.control_table import ControlItem
 from dxlwire.exchange.arrays import Floats
 from dxlwire.modes import COMMAND_INTERFACES
 
+_AGE = ""  # Place of the ages among the numbers; no item has this name
 
-class ServoStates:
+
+class ServoStates(msgspec.Struct, eq=False):
     """Values of one read, with one element for each servo in the order of `ids`.
 
     An item is an attribute under its name, with or without `present_`: `state.position`,
     `state.goal_position`. A servo that did not answer keeps its last values, NaN before the first."""
 
-    __slots__ = ("_age_ns", "_items", "_values", "alert", "ids", "valid")
+    ids: tuple[int, ...]
+    valid: NDArray[np.bool_]  # True for each servo that answered
+    _numbers: Floats
+    _alert: NDArray[np.bool_]
+    _places: Mapping[str, slice]
 
-    def __init__(  # noqa: PLR0917  the arrays of a state
-        self,
-        items: dict[str, int],
-        ids: tuple[int, ...],
-        values: Floats,
-        valid: NDArray[np.bool_],
-        age_ns: NDArray[np.int64],
-        alert: NDArray[np.bool_],
-    ) -> None:
-        self._items = items
-        self._values = values
-        self._age_ns = age_ns
-        self.ids = ids
-        self.valid = valid  # True for each servo that answered
-        self.alert = alert
+    @property
+    def alert(self) -> NDArray[np.bool_]:
         """True for each servo whose last reply reported an error, such as an overload; the item
         `hardware_error_status` has it."""
+        return self._alert.copy()
 
     @property
     def age(self) -> Floats:
         """Age of the values, seconds; NaN before the first reply."""
-        return np.where(self._age_ns < 0, np.nan, self._age_ns * 1e-9)
+        age_ns = self._numbers[self._places[_AGE]].view(np.int64)
+        return np.where(age_ns < 0, np.nan, age_ns * 1e-9)
 
     def __getattr__(self, name: str) -> Floats:
         if name.startswith("_"):  # `copy` and `pickle` ask for special methods before there are items
             raise AttributeError(name)
         try:
-            values: Floats = self._values[self._items[name]]
+            values: Floats = self._numbers[self._places[name]]
         except KeyError:
             raise AttributeError(f"this reader has no item {name!r}") from None
         return values
@@ -62,9 +56,8 @@ class ServoStates:
         return self.__getattr__(item)
 
     def __repr__(self) -> str:
-        return (
-            f"ServoStates({', '.join(self._items)}; {np.count_nonzero(self.valid)} of {len(self.ids)} valid)"
-        )
+        items = ", ".join(name for name in self._places if name != _AGE)
+        return f"ServoStates({items}; {np.count_nonzero(self.valid)} of {len(self.ids)} valid)"
 
 
 class ServoRows(msgspec.Struct):
@@ -86,12 +79,17 @@ class ReadRows(ABC):
         count = len(servos)
         self.ids = tuple(servo.servo_id for servo in servos)
         self._items = {name: index for index, name in enumerate(items)}
-        self._items |= {name.removeprefix("present_"): index for name, index in self._items.items()}
-        self._values: Floats = np.full((len(items), count), np.nan)
-        self._arrays = ServoRows(
-            self._values.reshape(-1), np.zeros(count, np.bool_), np.full(count, -1, np.int64)
-        )
-        self._alert = np.zeros(count, np.bool_)
+        self._places = {name: slice(row * count, (row + 1) * count) for name, row in self._items.items()}
+        self._places |= {name.removeprefix("present_"): place for name, place in self._places.items()}
+        self._places[_AGE] = slice(len(items) * count, None)
+        # Values and ages are one array, because each copy takes longer than its bytes. An age is an integer.
+        self._numbers: Floats = np.full((len(items) + 1) * count, np.nan)
+        age_ns = self._numbers[self._places[_AGE]].view(np.int64)
+        age_ns.fill(-1)
+        values = self._numbers[: len(items) * count]
+        self._arrays = ServoRows(values, np.zeros(count, np.bool_), age_ns)
+        self._values: Floats = values.reshape(len(items), count)
+        self._alert = np.zeros(count, np.bool_)  # States share it, so it is replaced as a whole
         # In Protocol 1.0 each bit of the error byte is a state of the servo.
         self._alert_bits = session.line.dialect.ALERT or 0xFF
 
@@ -109,16 +107,9 @@ class ReadRows(ABC):
         """Instructions of one call in the e-Manual's words."""
 
     def newest_state(self) -> ServoStates:
-        """Return the values of the newest cycle."""
-        arrays = self._arrays
-        return ServoStates(
-            self._items,
-            self.ids,
-            self._values.copy(),
-            arrays.valid.copy(),
-            arrays.age_ns.copy(),
-            self._alert.copy(),
-        )
+        """Return a copy of the values of the newest cycle."""
+        valid = self._arrays.valid.copy()
+        return ServoStates(self.ids, valid, self._numbers.copy(), self._alert, self._places)
 
 
 class WrittenRows(ABC):
@@ -130,7 +121,7 @@ class WrittenRows(ABC):
         check_different(items)
         session.cycles += 1
         self._goals: Floats = np.full((len(COMMAND_INTERFACES), len(servos)), np.nan)
-        self._count = len(items)
+        self._rows = tuple(self._goals[: len(items)])
 
     def send_values(self, values: Sequence[ArrayLike]) -> None:
         """Send one packet for each block of items, which no servo acknowledges.
@@ -139,24 +130,27 @@ class WrittenRows(ABC):
             ValueError: An argument has more or fewer values than servos, or no numbers.
             PortError: The line is closed or lost.
         """
-        if len(values) != self._count:
-            raise TypeError(f"this writer takes {self._count} values, one for each item; got {len(values)}")
-        for row, value in enumerate(values):
-            try:
-                self._goals[row] = value
-            except ValueError:
-                if (given := np.size(value)) in (1, servos := self._goals.shape[1]):
-                    raise  # Not numbers
-                raise ValueError(f"argument {row + 1}: {given} values for {servos} servos") from None
-        goals = self._goals[: self._count]
-        if self._count > 1 and math.isnan(goals.sum()):  # Quicker than to look at each goal
-            # Half of a servo's values would be sent with zeros or old ones for the rest
-            goals[:, np.isnan(goals).any(axis=0)] = np.nan
+        rows = self._rows
+        if len(values) != len(rows):
+            raise TypeError(f"this writer takes {len(rows)} values, one for each item; got {len(values)}")
+        index = 0
+        try:
+            for value in values:
+                rows[index][...] = value
+                index += 1  # `enumerate` takes longer
+        except ValueError:
+            if (given := np.size(values[index])) in (1, servos := self._goals.shape[1]):
+                raise  # Not numbers
+            raise ValueError(f"argument {index + 1}: {given} values for {servos} servos") from None
         self.send_goals()
 
     @abstractmethod
     def send_goals(self) -> None:
-        """Send the goals. Raises PortError if the line is closed or lost."""
+        """Send the goals of each servo that has one for every item.
+
+        Raises:
+            PortError: The line is closed or lost.
+        """
 
 
 def check_different(items: Sequence[str]) -> None:

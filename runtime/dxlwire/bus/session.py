@@ -139,7 +139,8 @@ class Session(OpenLine):
 
     def check_open(self) -> None:
         """Raise PortError if the line is closed or lost."""
-        super().check_open()
+        if self._closed:
+            super().check_open()
         if self.engine.failure is not None:
             raise self.engine.failure
 

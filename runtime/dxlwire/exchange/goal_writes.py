@@ -152,11 +152,12 @@ class SyncWrite(msgspec.Struct, frozen=True):
     """One block of goals that one packet writes to servos of one bus which are in the same mode."""
 
     layout: GoalLayout
-    lead: int  # Row of the leading goal; a servo without it gets no goals
+    lead: int  # Row of the leading goal; a servo for which it is NaN gets no goals
     members: tuple[int, ...]  # Indices of the servos on the bus
     rows: tuple[int, ...]
     ids: tuple[int, ...]
     cells: tuple[list[GoalCell], ...]  # Goal items of each servo, in the order of the wire
+    leads: int = 1  # Rows that are leading goals, from `lead` on
     always: bool = False  # Send every goal in every call, changed or not
 
 

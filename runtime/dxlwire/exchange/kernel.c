@@ -107,8 +107,9 @@ typedef struct { /* goals.SyncWrite */
     uint8_t *served; /* 1 if the servo could get a goal in the previous cycle */
     int64_t *sent_at;
     int64_t cycle;
-    int32_t count, items, address, length, lead;
-    int32_t always; /* 1: every goal is sent by every call, changed or not */
+    int32_t count, items, address, length;
+    int32_t lead, leads; /* goals that must be numbers: `leads` rows from `lead` on */
+    int32_t always;      /* 1: every goal is sent by every call, changed or not */
 } SyncWrite;
 
 typedef struct {
@@ -831,7 +832,9 @@ static int32_t build(Kernel *k, const Line *l, SyncWrite *w, uint8_t *packet)
     for (int32_t m = 0; m < w->count; m++) {
         int32_t index = w->members[m], row = w->rows[m], *ticks = w->ticks + m * w->items;
         const Cell *cells = w->cells + m * w->items;
-        uint8_t served = l->included[index] && !isnan(k->goals[w->lead][row]), changed = 0;
+        uint8_t served = l->included[index], changed = 0;
+        for (int32_t n = w->lead; n < w->lead + w->leads; n++)
+            served = served && !isnan(k->goals[n][row]);
         for (int32_t c = 0; c < w->items; c++) {
             int32_t t = goal_tick(&cells[c], k->goals[cells[c].interface][row], l->ceiling[index]);
             changed |= t != ticks[c];

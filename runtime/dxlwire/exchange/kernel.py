@@ -542,6 +542,7 @@ def _laid_write(write: SyncWrite) -> tuple[ctypes.Structure, list[object]]:
         address=write.layout.address,
         length=write.layout.length,
         lead=write.lead,
+        leads=write.leads,
         always=write.always,
         cells=ctypes.addressof(cells),
         **{name: array.ctypes.data for name, array in arrays.items()},
