@@ -40,7 +40,10 @@ LEAST_QUIET_NS = 200_000  # Minimum of that time, reached at 1 Mbit/s and above
 DRAIN_LIMIT_NS = 5_000_000  # A line that keeps sending noise for longer than this is not drained any further
 PATIENT_DRAIN_LIMIT_NS = 200_000_000  # The same limit for a job that has no deadline
 LOST_LINE_STEP_NS = 200_000  # Interval at which the other lines are checked while one is lost
-BEAT_NS = 1_000_000  # Longest interval between two calls of `beat`, not counting one wait
+BEAT_NS = 5_000_000
+"""Longest interval between two calls of `beat`, not counting one wait, and longest wait of the kernel, ns. A
+wait that ends before the next tick of a stock Linux (4 ms) sets the timer of the processor and resets it,
+which takes some 10 us in a virtual machine."""
 MOST_LATE_NS = 1_000_000
 """Cap for the measured lateness of replies, ns. A later reply is an accident, such as a stall of this
 process, and not a property of the line."""

@@ -731,13 +731,19 @@ static int is_in_time(Kernel *k, int64_t now)
     return 1;
 }
 
+/* Return the time of the next beat. `beat_ns` may be NEVER: no overflow. */
+static int64_t beat_after(const Kernel *k, int64_t now)
+{
+    return NEVER - now < k->beat_ns ? NEVER : now + k->beat_ns;
+}
+
 static int32_t read_all(Kernel *k)
 {
     uint8_t ready[MOST_LINES];
     int64_t now = now_ns(k);
     if (!is_in_time(k, now))
         return SILENCE;
-    int64_t stop = NEVER - now < k->beat_ns ? NEVER : now + k->beat_ns; /* `beat_ns` may be NEVER: no overflow */
+    int64_t stop = beat_after(k, now);
     int32_t idle = 0;
     for (int32_t i = 0; i < k->line_count; i++) { /* before the reads, as the parser may settle this cycle */
         const Line *l = &k->lines[i];
@@ -769,7 +775,7 @@ static int32_t read_all(Kernel *k)
             break;
         if (now >= stop)
             return WAITING;
-        int64_t end = deadline < stop ? deadline : stop;
+        int64_t beat = beat_after(k, now), end = deadline < beat ? deadline : beat;
         int32_t found = k->polling.enabled && !k->ports ? poll_for_replies(k, end, ready) : 0;
         if (!found)
             found = wait_for(k, end, ready);
