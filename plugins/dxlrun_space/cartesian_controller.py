@@ -34,9 +34,8 @@ from dxlrun import (
     ParametersModel,
     RobotModel,
 )
-from dxlrun.tooling.robots import read_urdf
-from dxlrun_space.arm_frames import ArmFrames
-from dxlrun_space.chain import BASE, IDENTITY, Chain, Pose, Vector, WrongChain, turned
+from dxlrun.tooling.robots import FrameTree, read_urdf
+from dxlrun_space.chain import BASE, IDENTITY, Chain, Pose, Vector, WrongChain, rotation_of, turned
 from dxlrun_space.path import MotionLimits, NoPath, Path, Planning, Positions, plan_joints, plan_line, shifted
 from dxlrun_space.solver import FULL, Solution, Solver, distance, residual_of
 from dxlrun_space.space_goals import (
@@ -222,21 +221,22 @@ class CartesianController(Controller[CartesianParameters]):
     ) -> None:
         """Raise ValueError for a frame that the robot does not have, or that an omitted joint moves."""
         if isinstance(command, PoseCommand | TwistCommand) and command.frame and robot.urdf:
-            _frames(robot.urdf, parameters.base, (*robot.joints, *robot.others)).movers(command.frame)
+            try:
+                _frames(robot.urdf, (*robot.joints, *robot.others)).movers(command.frame, parameters.base)
+            except LookupError as error:
+                raise ValueError(error.args[0]) from None
 
     def on_configure(self, context: Context) -> None:
         """Build the chain, and everything that the loop needs."""
         super().on_configure(context)
         parameters, limits = self.parameters, context.limits
-        if context.urdf is None:
-            raise ValueError("no URDF; write `model: {urdf: NAME.urdf}`")
-        urdf, leader = read_urdf(context.urdf), parameters.leader
+        urdf, leader = read_urdf(context.urdf or ""), parameters.leader
         self._chain = Chain(urdf, parameters.base, parameters.tip, context.joints)
         self._leader = None if leader is None else Chain(urdf, leader.base, leader.tip, leader.joints)
         self._others = [name.partition("/")[0] for name in context.read_names[: len(context.reads) // 2]]
         self._position, self._age = context.reads.reshape(2, -1)
         """Positions and ages of the leader's joints, or of the others."""
-        self._frames = ArmFrames(urdf, parameters.base, (*context.joints, *self._others))
+        self._frames = FrameTree(urdf, (*context.joints, *self._others))
         lower, upper = limits.lower.tolist(), limits.upper.tolist()
         self._limits = MotionLimits(
             tuple(np.where(np.isnan(limits.velocity), SPEED, limits.velocity).tolist()),
@@ -281,10 +281,6 @@ class CartesianController(Controller[CartesianParameters]):
         self._hold_joints()
         self._write()
 
-    def on_deactivate(self, time_ns: int) -> None:
-        """Drop the goal, which the runtime has ended."""
-        self._goal = None
-
     def _hold_joints(self) -> None:
         """Hold the positions that were sent, or else the measured ones."""
         goals, states = self.context.goals.position, self.context.states.position
@@ -302,19 +298,17 @@ class CartesianController(Controller[CartesianParameters]):
         self._goal, self._is_cancelled, self._feedback_ns = goal, False, time_ns + FEEDBACK_NS
         if not self._at:
             self._hold_joints()
-        if not self._at:
-            unknown = np.isnan(self.context.states.position)
-            joint = self.context.joints[int(unknown.argmax())]
+        if self._at:
+            self._pass_to(unpacked(data, POSES))
+        else:
+            joint = self.context.joints[int(np.isnan(self.context.states.position).argmax())]
             self._end(Outcome.ABORTED, f"joint {joint} has not answered yet")
-            return
-        self._pass_to(unpacked(data, POSES))
 
     def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
         """Follow a twist; a pose that is under way ends as preempted. Or plan without moving."""
-        if not self._at:
-            self._hold_joints()
         if kind == "twist":
-            self._follow(unpacked(data, TWISTS), time_ns)
+            if self._at:
+                self._follow(unpacked(data, TWISTS), time_ns)
         elif self._moves or self._goal is not None:
             self._publish(NoPath("the arm moves; ask again when it rests"))
         else:
@@ -324,7 +318,7 @@ class CartesianController(Controller[CartesianParameters]):
         self._turns_with_tip = twist.frame == self._chain.tip
         try:
             rotation = IDENTITY if self._turns_with_tip else self._pose_of(twist.frame)[0]
-        except ValueError as error:
+        except (LookupError, ValueError) as error:
             if not self._is_ignoring:
                 self.context.warn(f"twist ignored: {error}")
             self._is_ignoring, self._twist = True, NO_TWIST
@@ -367,11 +361,11 @@ class CartesianController(Controller[CartesianParameters]):
             goal.end(outcome, text)
 
     def _pose_of(self, frame: str) -> Pose:
-        """Return the pose of a frame in the base. Raises ValueError with the joint that prevents it."""
+        """Return the pose of a frame in the base. Raises LookupError or ValueError with what prevents it."""
         if not frame:
             return BASE
         positions: dict[str, float] = {}
-        for joint in self._frames.movers(frame):
+        for joint in self._frames.movers(frame, self._chain.base):
             if joint in self.context.joints:
                 positions[joint] = self._at[self.context.joints.index(joint)]
                 continue
@@ -379,7 +373,8 @@ class CartesianController(Controller[CartesianParameters]):
             if silence := self._silence(index):
                 raise ValueError(f"no reply from {joint} {silence}, which moves frame {frame}")
             positions[joint] = float(self._position[index])
-        return self._frames.pose(frame, positions)
+        pose = self._frames.pose(frame, self._chain.base, positions)
+        return rotation_of(pose.rotation), pose.translation
 
     def _silence(self, index: int) -> str:
         """Return for how long a joint that is read has not answered; empty if it answers."""
@@ -417,7 +412,7 @@ class CartesianController(Controller[CartesianParameters]):
         """Plan a motion from rest, some steps in each cycle."""
         try:
             frame = self._pose_of(asked.frame)
-        except ValueError as error:
+        except (LookupError, ValueError) as error:
             return NoPath(str(error))
         solver, exact = self._solver, self._exact and asked.asks_orientation
         if asked.positions:
@@ -571,5 +566,5 @@ def _remark(path: Path, asked: PoseGoal) -> str:
 
 
 @lru_cache(maxsize=8)
-def _frames(urdf: str, base: str, joints: tuple[str, ...]) -> ArmFrames:
-    return ArmFrames(read_urdf(urdf), base, joints)
+def _frames(urdf: str, joints: tuple[str, ...]) -> FrameTree:
+    return FrameTree(read_urdf(urdf), joints)

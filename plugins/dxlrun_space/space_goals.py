@@ -16,52 +16,38 @@ from dxlrun_space.chain import Pose, Quaternion, Vector, compose, inverted, rota
 
 NORM: Final = 1e-3
 """Largest difference of a quaternion's length from 1: three decimals of each number."""
-_LONGEST_NAME: Final = 200
 T = TypeVar("T")
 
 
-def _number(adapter: TypeAdapter[float]) -> BeforeValidator:
-    """Return a validator that converts a text with a unit to SI; a number is SI already."""
+def _si(adapter: TypeAdapter[float]) -> BeforeValidator:
+    """Return a validator that converts a text to SI by its unit; a number is SI already."""
     return BeforeValidator(lambda value: adapter.validate_python(value) if isinstance(value, str) else value)
 
 
-_angle: Final = TypeAdapter(Angle)
-
-
-def _angles(value: object) -> object:
-    """Convert three angles, as a list or as `0, 90 deg, 0`, to rad; 0 needs no unit."""
-    parts = value.split(",") if isinstance(value, str) else value
-    if not isinstance(parts, list | tuple):
-        return value
-    return tuple(_rad(part.strip() if isinstance(part, str) else part) for part in parts)
-
-
-def _floats(value: object) -> object:
-    """Convert numbers with commas between them, and a list."""
-    try:
-        return tuple(map(float, value.split(","))) if isinstance(value, str) else _tuple(value)
-    except ValueError:
-        return value
-
-
-def _tuple(value: object) -> object:
-    return tuple(value) if isinstance(value, list) else value
-
-
 def _rad(value: object) -> object:
+    """Convert an angle; 0 needs no unit, and more than a turn is deg without its unit."""
     if isinstance(value, str):
-        value = 0.0 if value in ("0", "0.0") else _angle.validate_python(value)
+        value = 0.0 if value.strip() in ("0", "0.0") else TypeAdapter(Angle).validate_python(value)
     if isinstance(value, int | float) and abs(value) > 2 * math.pi:
         raise ValueError(f"{value:g} rad is more than a turn; write the unit, such as {value:g}deg")
     return value
 
 
+def _items(value: object) -> object:
+    """Split a text such as `0, 90 deg, 0` at its commas."""
+    value = value.split(",") if isinstance(value, str) else value
+    return tuple(value) if isinstance(value, list) else value
+
+
 _range = Field(ge=-100, le=100)  # beyond, products overflow to infinity and then to NaN
-_Metres = Annotated[float, _number(TypeAdapter(Length)), _range]
-_Speed = Annotated[float, _number(TypeAdapter(LinearVelocity)), _range]
-_Turn = Annotated[float, _number(TypeAdapter(AngularVelocity)), _range]
-_Angles = Annotated[tuple[float, float, float], BeforeValidator(_angles)]
-_Frame = Annotated[str, Field(max_length=_LONGEST_NAME)]
+_Metres = Annotated[float, _si(TypeAdapter(Length)), _range]
+_Speed = Annotated[float, _si(TypeAdapter(LinearVelocity)), _range]
+_Turn = Annotated[float, _si(TypeAdapter(AngularVelocity)), _range]
+_Rad = Annotated[float, BeforeValidator(_rad)]
+_Angles = Annotated[tuple[_Rad, _Rad, _Rad], BeforeValidator(_items)]
+_Real = Annotated[float, _si(TypeAdapter(float))]
+_Four = Annotated[tuple[_Real, _Real, _Real, _Real], BeforeValidator(_items)]
+_Frame = Annotated[str, Field(max_length=200)]
 
 
 class PoseCommand(CommandModel):
@@ -82,7 +68,7 @@ class PoseCommand(CommandModel):
     Without an orientation the tip keeps the present one as far as the arm can"""
     drpy: _Angles | None = None
     """Turn from the orientation at the start about the axes of the frame, rad"""
-    quaternion: Annotated[tuple[float, float, float, float], BeforeValidator(_floats)] | None = None
+    quaternion: _Four | None = None
     """Goal orientation in the frame: x, y, z, w"""
     frame: _Frame = ""
     """Link in whose axes, at the start, all values are; empty: the base of the controller"""

@@ -140,6 +140,18 @@ def test_what_cannot_be_is_refused_before_a_joint_moves(pose: dict[str, Any], te
     assert (stage.goal.ended[0][0], stage.goal.ended[0][1][: len(text)]) == ("aborted", text)
 
 
+def test_a_named_pose_is_reached_by_its_own_joints() -> None:
+    arm, chance = all_arms()["six"], random.Random(3)
+    for _ in range(5):
+        stage, positions = staged("six", arm.drawn(chance)), arm.drawn(chance)
+        named = dict(zip(arm.joints, positions, strict=True))
+        stage.send(0.0, "pose", pose={**named, "gripper": 0.0})
+        assert played(stage, 9.0)[-1] == pytest.approx(positions, abs=1e-4)
+        assert stage.goal.ended[0][0] == "reached"
+    with pytest.raises(ValueError, match="the pose has no position of "):
+        stage.prepare("pose", pose={arm.joints[2]: 0.1})
+
+
 def test_a_duration_is_kept() -> None:
     stage = staged()
     stage.send(0.0, "pose", dz=0.05, seconds=3.0)
@@ -239,6 +251,7 @@ def test_a_joint_that_has_not_answered_refuses_goals() -> None:
     stage.activate()
     stage.send(0.0, "pose", dz=0.1)
     assert stage.goal.ended[0][1] == "joint joint3 has not answered yet"
+    stage.give("twist", vz=0.1, frame="link5")  # has no effect
 
 
 def test_only_frames_that_a_silent_joint_moves_are_refused() -> None:

@@ -207,7 +207,11 @@ class FrameTree:
     def movers(self, of: str, relative_to: str = "") -> tuple[str, ...]:
         """Return the joints that move the frame `of` in another frame; empty: the root.
 
-        A joint that mimics another one is not among them, but that one is. Raises LookupError as `pose`.
+        A joint that mimics another one is not among them, but that one is.
+
+        Raises:
+            LookupError: A frame does not exist.
+            ValueError: A joint that moves the frame has no servo in this run.
         """
         ends = self._ends(of, relative_to)
         shared, found = self._shared(*ends), dict[str, None]()
@@ -217,6 +221,8 @@ class FrameTree:
                 if frame.joint is not None and frame.joint.moves:
                     found[leader(self._joints, frame.joint, self.moved)[0].name] = None
                 frame = self._frames[frame.parent]
+        if lacking := next((joint for joint in found if joint not in self.moved), ""):
+            raise ValueError(f"frame {of} moves with joint {lacking}, which is omitted or has no servo")
         return tuple(found)
 
     def pose(
