@@ -75,7 +75,7 @@ def library() -> ctypes.PyDLL:
         ("end_step", None, (c_void_p,)),
         ("follow", c_int32, (c_void_p,)),
         ("is_moving", c_int32, (c_void_p,)),
-        ("next_action", c_int64, (c_void_p,)),
+        ("next_step", c_int64, (c_void_p,)),
         ("plan", c_int32, (c_void_p, c_int32)),
         ("position_tick", c_double, (c_void_p, c_double)),
         ("show", None, (c_void_p, c_int64, c_int32, c_int32)),

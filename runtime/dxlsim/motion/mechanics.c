@@ -25,6 +25,10 @@
 #define ARRIVED 1e-9 /* rad; distance to the goal at which a trajectory ends */
 #define UNWOUND 1e-6 /* duty/s; an integral that changes the duty more slowly counts as constant */
 #define LEAST_P 1e-9 /* duty per rad; bounds the integrated speed error of a velocity controller with a tiny gain */
+/* Intervals at which a step is due in real time while servos move, and while they only cool, ns. Catching up after a long
+ * pause of the host would delay the next reply. */
+#define EAGER_NS 4000000
+#define EASY_NS 1000000000
 #define STEPS_A_LOOK 16 /* steps between two checks for rest */
 #define STILL 1e-6      /* rad/s; a servo rests below it, and below UNDRIVEN */
 #define UNDRIVEN 1e-8   /* rad/s, change of the speed in a step */
@@ -340,9 +344,22 @@ void motion_end_step(Mechanics *m)
 }
 
 /* Time of the next action or aim; INT64_MAX: none. */
-int64_t motion_next_action(const Mechanics *m)
+static int64_t next_action(const Mechanics *m)
 {
     return m->aim_count && m->aims[0].t_ns < m->agenda_ns ? m->aims[0].t_ns : m->agenda_ns;
+}
+
+/* Time at which a step is due in real time, even without requests of hosts; INT64_MAX: nothing moves or cools. */
+int64_t motion_next_step(const Mechanics *m)
+{
+    int64_t action_ns = next_action(m), easy_ns = m->grid_ns + EASY_NS;
+    if (!m->count)
+        return INT64_MAX;
+    if (!m->still)
+        return m->grid_ns + EAGER_NS;
+    if (action_ns != INT64_MAX)
+        action_ns += m->step_ns;
+    return m->calm || action_ns < easy_ns ? action_ns : easy_ns;
 }
 
 /* Change only a servo's goal, rad, and the speed, rad/s, and acceleration, rad/s^2, of its trajectory. */
@@ -385,7 +402,7 @@ void motion_withdraw(Mechanics *m, int64_t index)
 /* Number of steps to skip while all servos rest: up to the next action or change of temperature. */
 static int64_t resting_steps(const Mechanics *m, int64_t now_ns)
 {
-    int64_t action_ns = motion_next_action(m), until_ns = action_ns < now_ns ? action_ns : now_ns;
+    int64_t action_ns = next_action(m), until_ns = action_ns < now_ns ? action_ns : now_ns;
     if (!m->calm && m->strain_ns < until_ns)
         until_ns = m->strain_ns;
     int64_t steps = (until_ns - m->grid_ns) / m->step_ns;

@@ -26,10 +26,6 @@ from dxlsim.simulation_plan import Load, SimulationConfig
 STEP_NS = 2_000_000
 """Step of the time grid, ns. The shortest time constant in a servo is that of its motor: 13.6 ms or more."""
 
-EAGER_NS, EASY_NS = 4_000_000, 1_000_000_000
-"""Intervals (ns) at which `step_to` is due in real time, while servos move and while they only cool.
-Catching up after a long pause of the host would delay the next reply."""
-
 STRAIN_NS = 100_000_000  # Interval at which heat and load are updated; a whole number of steps
 
 AMBIENT_C = 30.0  # Temperature of a servo at rest, degrees C [i]
@@ -241,20 +237,6 @@ class Mechanics:
         heapq.heappush(self._agenda, (t_ns, self._state.order, action))
         self._state.order += 1
         self._state.agenda_ns, self._state.agenda_order, _ = self._agenda[0]
-
-    def due_ns(self) -> int | None:
-        """Return the time at which `step_to` must be called in real time, even without requests of hosts;
-        None if nothing moves or cools."""
-        if not self._motors:
-            return None
-        if not self.still:
-            return self.grid_ns + EAGER_NS
-        next_ns = self._library.motion_next_action(self.address)
-        agenda_ns = None if next_ns == _NEVER else next_ns + STEP_NS
-        if self._state.calm:
-            return agenda_ns
-        easy_ns = self.grid_ns + EASY_NS
-        return easy_ns if agenda_ns is None else min(easy_ns, agenda_ns)
 
     def step_to(self, now_ns: int) -> None:
         """Step all servos up to the last grid point at or before `now_ns`."""

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 
-from dxlsim.bus.ledger import FAULT, Ledger
+from dxlsim.bus.ledger import FAULT, FLUSH_NS, Ledger
 from dxlsim.bus.recorded_bus import RecordedBus
 from dxlsim.bus.recording import RecordedPackets
 from dxlsim.bus.simulated_bus import SimulatedBus
@@ -21,18 +21,16 @@ from dxlsim.faults.fault import parse_fault
 from dxlsim.faults.script import FaultScript
 from dxlsim.messages import ServoLook, SimulationMessage
 from dxlsim.motion.body import ShaftPublisher, ShaftSink
+from dxlsim.motion.compiled_mechanics import function_address
 from dxlsim.motion.mechanics import Mechanics, plant_of
 from dxlsim.registers.memory import Memory
 from dxlsim.serving.host import ServerProgressReceiver, Starter
 from dxlsim.serving.pseudo_terminal import DeviceLink, PseudoTerminal
 from dxlsim.simulation_plan import SimulationConfig
-from dxlsim.wire.compiled_line import NEVER_NS, STALLED, ServerState, line_library, waiting_function
+from dxlsim.wire.compiled_line import NEVER_NS, STALLED, ServerState, line_library
 from dxlwire.exceptions import InputError
 
-IDLE_NS = 300_000  # Time reserved for a few steps of the mechanics
-
 _ADAPTER, _ASKED, _RAISED = 1, 2, 4  # Bits of what Python has to do after `line_serve`
-_BUDGET_NS = 20_000_000  # Time for which a server may poll at first, ns
 
 _GOAL_MODES = (3, 4, 5)
 """Values of Operating Mode (11) with a goal position: position, extended position, current-based position
@@ -105,16 +103,19 @@ class Server:
         self._state = ServerState(
             terminals=ctypes.addressof(self._addresses),
             stalled=ctypes.cast(self._stalled, ctypes.c_void_p),
-            easy_ns=NEVER_NS,
+            release=ctypes.cast(ctypes.pythonapi.PyEval_SaveThread, ctypes.c_void_p),
+            acquire=ctypes.cast(ctypes.pythonapi.PyEval_RestoreThread, ctypes.c_void_p),
+            next_step=function_address("next_step"),
+            ledger=ctypes.addressof(ledger.state),
+            flush_ns=FLUSH_NS,
             looked_ns=self.start_ns,
             count=len(terminals),
             waiting=self._waiting.fileno(),
             watched=progress is not None,
+            single=shafts is not None,
         )
-        polling = self._state.polling
-        polling.budget_ns, polling.asked_ns, polling.woken_ns = _BUDGET_NS, self.start_ns, self.start_ns
         self._address = ctypes.addressof(self._state)
-        self._library, self._wait = line_library(), waiting_function()
+        self._library = line_library()
 
     def serve_ports(self, granted: str = "", stop: int = -1) -> None:
         """Report the ports and the granted real-time properties to the starter, then serve until the end.
@@ -145,10 +146,8 @@ class Server:
             bus.excuse(end_ns - begin_ns)
 
     def _serve_once(self, stop: int) -> None:
-        soonest_ns, now_ns = self._library.line_find_delivery(self._address), time.monotonic_ns()
-        idle = soonest_ns - now_ns > IDLE_NS  # No reply is about to be sent
-        self._state.easy_ns = self._work_in_idle_time(now_ns) if idle else NEVER_NS
-        self._wait(self._address)
+        flush_ns = self._ledger.flush_due_ns()
+        self._state.python_ns = NEVER_NS if flush_ns is None else flush_ns
         news = self._library.line_serve(self._address)
         if news & _RAISED:
             for bus in self._buses:
@@ -160,15 +159,7 @@ class Server:
             self._tell(SimulationMessage(self._ports()))
         if news & _ASKED:
             self._answer_requests(stop)
-        self._ledger.flush_if_due(now_ns)
-
-    def _work_in_idle_time(self, now_ns: int) -> int:
-        """Step the mechanics and resume reading slowed hosts; return the time (ns) at which more such work
-        is due."""
-        self._mechanics.step_to(now_ns)
-        resumed_ns: int = self._library.line_resume(self._address, now_ns)
-        times = [self._ledger.flush_due_ns(), self._mechanics.due_ns()]
-        return min([resumed_ns, *(t_ns for t_ns in times if t_ns is not None)])
+        self._ledger.flush_if_due(time.monotonic_ns())
 
     def _plug(self) -> None:
         """Wait for the terminals that exist now, after an adapter was unplugged or plugged in."""

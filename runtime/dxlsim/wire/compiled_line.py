@@ -29,12 +29,11 @@ STRUCTS = parse_structs(SOURCE.read_text())
     Ports,
     TerminalState,
     ServerState,
-    PollBudget,
 ) = (
     STRUCTS[name]
     for name in (
         *("Node", "Goal", "Line", "Ledger", "Entry", "Asked"),
-        *("Port", "Ports", "Terminal", "Server", "PollBudget"),
+        *("Port", "Ports", "Terminal", "Server"),
     )
 )
 _Packet, _Receiver = STRUCTS["Packet"], STRUCTS["Receiver"]
@@ -82,10 +81,10 @@ _FUNCTIONS: dict[str, tuple[type | None, tuple[object, ...]]] = {
     "discard": (None, (c_void_p,)),
     "discard_packet": (None, (c_void_p,)),
     "drain": (c_int64, (c_void_p, c_int64, c_int64)),
+    "early": (c_int64, (c_int64, c_int64)),
     "execute": (None, (c_void_p, c_char_p, c_int64, c_int64)),
     "execute_altered": (None, (c_void_p, c_char_p, c_int64)),
     "feed": (c_int32, (c_void_p, c_char_p, c_int64, c_int64, c_void_p)),
-    "find_delivery": (c_int64, (c_void_p,)),
     "forget": (None, (c_void_p,)),
     "free": (None, (c_void_p,)),
     "free_ledger": (None, (c_void_p,)),
@@ -106,25 +105,23 @@ _FUNCTIONS: dict[str, tuple[type | None, tuple[object, ...]]] = {
     "read_chunk": (c_int32, (c_void_p,)),
     "receive": (None, (c_void_p, c_char_p, c_int64, c_int64)),
     "receiver": (c_void_p, (c_int32,)),
-    "resume": (c_int64, (c_void_p, c_int64)),
     "send": (None, (c_void_p, c_char_p, c_int64, c_int64, c_char_p)),
     "send_copy": (None, (c_void_p, c_char_p, c_int64, c_int64, c_int32, c_int32)),
     "send_reply": (None, (c_void_p, c_int32, c_char_p, c_int64, c_int64, c_int64)),
     "set_timer": (None, (c_void_p, c_int64)),
     "serve": (c_int32, (c_void_p,)),
-    "sleep_ns": (c_int64, (c_void_p, c_int64, c_int64, c_int64)),
     "start": (None, (c_void_p,)),
     "status": (c_int64, (c_int32, c_int32, c_int32, c_char_p, c_int64, c_void_p)),
     "take": (c_int64, (c_void_p, c_void_p, c_int64)),
     "watch": (None, (c_void_p, c_int32)),
     "withdraw": (None, (c_void_p,)),
-    "woke": (None, (c_void_p, c_int64)),
 }
 """Functions of the library without their prefix, with the types of result and arguments."""
 
 
 class LineLibrary(ctypes.PyDLL):
-    """The compiled line. Calls hold the interpreter lock: they are shorter than its release."""
+    """The compiled line. Calls hold the interpreter lock, because they are shorter than its release; while a
+    server sleeps, its functions `release` and `acquire` give the lock to other threads."""
 
 
 @cache
@@ -139,13 +136,6 @@ def line_library() -> LineLibrary:
         function = getattr(found, f"line_{name}", None)  # Only Linux has those of pseudo-terminals
         if function is not None:
             function.argtypes, function.restype = arguments, result
-    return found
-
-
-def waiting_function() -> Callable[[int], None]:
-    """Return the function that waits for a server's next event, without the interpreter lock."""
-    found = load_compiled(SOURCE, ctypes.CDLL).line_wait
-    found.argtypes, found.restype = (c_void_p,), None
     return found
 
 

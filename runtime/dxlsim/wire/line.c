@@ -101,7 +101,7 @@ typedef struct { /* one servo or device, as the line sees it */
 
 typedef struct { /* entries of simulated buses, which Python takes in batches */
     Bytes entries;
-    int64_t most; /* bytes from which Python is asked to take them; 0: never */
+    int64_t most; /* bytes from which Python is asked to take them; 0: no file is written */
     int32_t on, unused;
 } Ledger;
 
@@ -515,7 +515,8 @@ static Transmission *transmission(const uint8_t *data, int64_t size, int64_t fir
 {
     Transmission *t = grown(NULL, (int64_t)sizeof *t + size);
     *t = (Transmission){.first_ns = first_ns, .due_ns = due_ns, .size = (int32_t)size, .uses = 1};
-    snprintf(t->note, sizeof t->note, "%s", text);
+    for (int32_t i = 0; i < NOTE_ROOM - 1 && text[i]; i++)
+        t->note[i] = text[i];
     if (size)
         memcpy(t->data, data, (size_t)size);
     return t;
@@ -1639,20 +1640,14 @@ int32_t line_port_wait(Ports *p, int64_t deadline_ns, uint8_t *ready) { return p
 #define GATHER_NS 250000             /* replies that end within this time are delivered together, as by USB */
 #define LONGEST_SLEEP_NS 10000000    /* while a host watches the progress, so that a longer pause shows as a stall */
 #define STALL_NS 20000000            /* pause between two readings of the clock from which it counts as a stall */
-#define LONGEST_POLL_NS 50000        /* before a reply is due: a sleep wakes some 30 us late on a stock kernel */
-#define POLL_SHARE 20                /* polling is limited to one part in this many of the time of waiting */
-#define BUDGET_NS 20000000
-#define PAUSE_NS 100000              /* shortest sleep while polling is not allowed */
+#define MOST_EARLY_NS 50000          /* a sleep ends some 30 us late on a stock kernel */
+#define SLOWLY 64                    /* sleeps in which the estimate of this time follows a longer one */
+#define IDLE_NS 300000               /* time before a delivery in which a few steps of the mechanics have room */
 #define EVENTS_A_LOOK 64             /* the others wait for the next look */
 #define OF_PYTHON UINT64_MAX         /* number of each descriptor of Python, which wakes the server as well */
 
 enum { TAKEN, SERVED, GIVEN, DUE }; /* words of a line's progress, for the host: heartbeat.py */
 enum { ADAPTER = 1, ASKED_FOR = 2, RAISED = 4 }; /* what Python has to do */
-
-typedef struct { /* decides how long a server sleeps before an event, and when it polls the clock instead */
-    int64_t budget_ns, asked_ns, woken_ns;
-    int32_t polls, unused;
-} PollBudget;
 
 typedef struct { /* simulation's end of a terminal, whose other end hosts open like the port of an adapter */
     Bus *bus;
@@ -1669,11 +1664,17 @@ typedef struct { /* simulation's end of a terminal, whose other end hosts open l
 typedef struct {
     Terminal **terminals;
     void (*stalled)(int64_t begin_ns, int64_t end_ns);
-    int64_t easy_ns; /* time of Python's next work, which need not be punctual; NEVER: none */
-    int64_t soonest_ns, looked_ns;
-    int32_t count, waiting; /* `waiting`: descriptor of epoll */
+    void *(*release)(void);        /* Python's lock: PyEval_SaveThread and PyEval_RestoreThread */
+    void (*acquire)(void *thread);
+    int64_t (*next_step)(const void *mechanics); /* motion_next_step of mechanics.c */
+    int64_t python_ns;             /* time of Python's next work, which need not be punctual; NEVER: none */
+    Ledger *ledger;
+    int64_t flush_ns;              /* delay of this work after the first entry of a ledger that is written to a file */
+    int64_t looked_ns;
+    int64_t early_ns;              /* time by which a sleep ends later than requested, at least */
+    int32_t count, waiting;        /* `waiting`: descriptor of epoll */
     int32_t watched, news;
-    PollBudget polling;
+    int32_t single, unused;        /* 1: Python looks at the shafts after each event */
 } Server;
 
 static int64_t clock_ns(void)
@@ -1681,35 +1682,6 @@ static int64_t clock_ns(void)
     struct timespec t;
     clock_gettime(CLOCK_MONOTONIC, &t);
     return (int64_t)t.tv_sec * 1000000000 + t.tv_nsec;
-}
-
-/* Return the time to sleep before the next event, ns; 0: poll the clock; NEVER: sleep until a host writes. `due_ns`:
- * next punctual event; `easy_ns`: next event that need not be punctual. Polling is punctual but uses the processor. It
- * is limited to a twentieth of the time by which the process waits longer than it works. */
-int64_t line_sleep_ns(PollBudget *p, int64_t due_ns, int64_t now_ns, int64_t easy_ns)
-{
-    int64_t spent_ns = (now_ns - p->woken_ns) / POLL_SHARE, left_ns = due_ns - now_ns;
-    p->asked_ns = now_ns;
-    p->budget_ns = p->budget_ns - spent_ns > -BUDGET_NS ? p->budget_ns - spent_ns : -BUDGET_NS;
-    p->polls = 0;
-    if (easy_ns != NEVER && (due_ns == NEVER || easy_ns < due_ns - LONGEST_POLL_NS))
-        return easy_ns > now_ns ? easy_ns - now_ns : 0;
-    if (due_ns == NEVER)
-        return NEVER;
-    if (left_ns > LONGEST_POLL_NS)
-        return left_ns - (p->budget_ns > 0 ? LONGEST_POLL_NS : 0);
-    p->polls = p->budget_ns > 0;
-    return p->polls || left_ns <= 0 ? 0 : PAUSE_NS;
-}
-
-/* Charge the time since the last `line_sleep_ns` to the budget; call it after each sleep or polling. */
-void line_woke(PollBudget *p, int64_t now_ns)
-{
-    int64_t waited_ns = now_ns - p->asked_ns, spent_ns = p->polls ? waited_ns : 0;
-    p->woken_ns = now_ns;
-    p->budget_ns += waited_ns / POLL_SHARE - spent_ns;
-    if (p->budget_ns > BUDGET_NS)
-        p->budget_ns = BUDGET_NS;
 }
 
 static void publish(Terminal *t, int32_t word, int64_t value)
@@ -1738,16 +1710,23 @@ static int64_t look_at_clock(Server *s)
     return now_ns;
 }
 
-/* Return the time of the next delivery to any host, NEVER without one; publish it for each line. */
-int64_t line_find_delivery(Server *s)
+static int has_run_task(const Server *s)
 {
-    look_at_clock(s);
-    s->soonest_ns = NEVER;
+    int any = 0;
+    for (int32_t i = 0; i < s->count; i++)
+        any |= s->terminals[i]->bus->line.done || s->terminals[i]->bus->line.raised;
+    return any;
+}
+
+/* Return the time of the next delivery to any host, NEVER without one; publish it for each line. */
+static int64_t find_delivery(const Server *s)
+{
+    int64_t soonest_ns = NEVER;
     for (int32_t i = 0; i < s->count; i++) {
         int64_t due_ns = publish_served(s->terminals[i]);
-        s->soonest_ns = due_ns < s->soonest_ns ? due_ns : s->soonest_ns;
+        soonest_ns = due_ns < soonest_ns ? due_ns : soonest_ns;
     }
-    return s->soonest_ns;
+    return soonest_ns;
 }
 
 static int32_t changed(const Terminal *t)
@@ -1851,36 +1830,38 @@ static int32_t look(Server *s)
     return found;
 }
 
-/* Wait until a host writes, a delivery is due, or Python has work. Runs without Python's lock. */
-void line_wait(Server *s)
+/* Return the estimate of the time by which a sleep ends too late, at least, after one that ended `late_ns` too late. */
+int64_t line_early(int64_t early_ns, int64_t late_ns)
 {
-    PollBudget *p = &s->polling;
-    int64_t now_ns = clock_ns(), easy_ns = s->easy_ns, due_ns = s->soonest_ns;
-    if (s->watched && now_ns + LONGEST_SLEEP_NS < easy_ns)
-        easy_ns = now_ns + LONGEST_SLEEP_NS;
-    int64_t sleep_ns = line_sleep_ns(p, due_ns, now_ns, easy_ns);
-    if (sleep_ns) {
-        struct pollfd one = {s->waiting, POLLIN, 0};
-        struct timespec timeout = {sleep_ns / 1000000000, sleep_ns % 1000000000};
-        ppoll(&one, 1, sleep_ns == NEVER ? NULL : &timeout, NULL); /* in ns: epoll alone has only milliseconds */
-        if (look(s) || due_ns == NEVER)
-            return;
-        now_ns = clock_ns();
-        line_woke(p, now_ns);
-        if (line_sleep_ns(p, due_ns, now_ns, NEVER))
-            return;
-    }
-    while (!look(s) && due_ns != NEVER && clock_ns() < due_ns)
-        ;
+    early_ns = late_ns < early_ns ? late_ns : early_ns + (late_ns - early_ns) / SLOWLY;
+    return early_ns < MOST_EARLY_NS ? early_ns : MOST_EARLY_NS;
 }
 
-/* Deliver what is due, and receive what hosts have written. Return what Python has to do. */
-int32_t line_serve(Server *s)
+/* Wait, without Python's lock, until a host writes, a delivery is due, or other work, which need not be punctual. */
+static void wait_for_event(Server *s, int64_t due_ns, int64_t easy_ns)
+{
+    void *thread = s->release();
+    int64_t wake_ns = due_ns == NEVER ? NEVER : due_ns - s->early_ns;
+    int64_t until_ns = easy_ns < wake_ns ? easy_ns : wake_ns, left_ns = until_ns - clock_ns();
+    struct pollfd one = {s->waiting, POLLIN, 0};
+    struct timespec timeout = {left_ns / 1000000000, left_ns % 1000000000};
+    /* ppoll, because epoll alone has only milliseconds */
+    if (left_ns <= 0 || ppoll(&one, 1, until_ns == NEVER ? NULL : &timeout, NULL))
+        look(s);
+    else if (until_ns == wake_ns) {
+        s->early_ns = line_early(s->early_ns, clock_ns() - wake_ns);
+        while (clock_ns() < due_ns) /* rarely: most sleeps end later than the estimate */
+            ;
+    }
+    s->acquire(thread);
+}
+
+/* Deliver what is due, the next at `due_ns`, and receive what hosts have written. */
+static void serve_event(Server *s, int64_t due_ns)
 {
     int64_t now_ns = look_at_clock(s);
-    line_woke(&s->polling, now_ns);
     /* Replies that were due before the host wrote go out first, because the host could have read them. */
-    for (int32_t i = 0; s->soonest_ns <= now_ns && i < s->count; i++)
+    for (int32_t i = 0; due_ns <= now_ns && i < s->count; i++)
         if (line_next_delivery(s->terminals[i]->bus, GATHER_NS) <= now_ns)
             deliver(s, s->terminals[i], now_ns);
     for (int32_t rounds = s->count, any = 1; any;) { /* a host that drives all buses writes to them in one go */
@@ -1899,15 +1880,10 @@ int32_t line_serve(Server *s)
             }
         any = any && --rounds > 0 && look(s);
     }
-    int32_t news = s->news;
-    s->news = 0;
-    for (int32_t i = 0; i < s->count; i++)
-        news |= s->terminals[i]->bus->line.raised ? RAISED : 0;
-    return news;
 }
 
 /* Resume reading slowed hosts. Return the time at which the next one is read; NEVER without one. */
-int64_t line_resume(Server *s, int64_t now_ns)
+static int64_t resume(Server *s, int64_t now_ns)
 {
     int64_t next_ns = NEVER;
     for (int32_t i = 0; i < s->count; i++) {
@@ -1921,6 +1897,47 @@ int64_t line_resume(Server *s, int64_t now_ns)
             next_ns = t->held_ns;
     }
     return next_ns;
+}
+
+/* Step the mechanics, and resume reading slowed hosts. Return the time at which other work than deliveries is due. */
+static int64_t work_in_idle_time(Server *s, int64_t now_ns)
+{
+    int64_t times[4] = {resume(s, now_ns), s->python_ns, NEVER, NEVER}, easy_ns = NEVER;
+    if (s->count) {
+        Bus *b = s->terminals[0]->bus;
+        step_to(b, now_ns);
+        times[2] = s->next_step(b->line.mechanics);
+    }
+    if (s->watched)
+        times[3] = now_ns + LONGEST_SLEEP_NS;
+    for (int32_t i = 0; i < 4; i++)
+        easy_ns = times[i] < easy_ns ? times[i] : easy_ns;
+    return easy_ns;
+}
+
+/* Serve until Python has something to do, and return what. A task of a line may have changed Python's plans, so it is
+ * returned after each, with 0. Python's lock is held, except while nothing is due. */
+int32_t line_serve(Server *s)
+{
+    for (int32_t left = 0; !left;) {
+        int64_t now_ns = look_at_clock(s), due_ns = find_delivery(s), easy_ns = NEVER;
+        for (int32_t i = 0; i < s->count; i++)
+            s->terminals[i]->bus->line.done = 0;
+        if (s->ledger->most && s->ledger->entries.size && s->python_ns == NEVER)
+            s->python_ns = now_ns + s->flush_ns;
+        if (due_ns - now_ns > IDLE_NS)
+            easy_ns = work_in_idle_time(s, now_ns);
+        if (!has_run_task(s)) {
+            wait_for_event(s, due_ns, easy_ns);
+            serve_event(s, due_ns);
+        }
+        left = s->news || s->single || s->looked_ns >= s->python_ns || has_run_task(s);
+    }
+    int32_t news = s->news;
+    s->news = 0;
+    for (int32_t i = 0; i < s->count; i++)
+        news |= s->terminals[i]->bus->line.raised ? RAISED : 0;
+    return news;
 }
 
 /* Begin to serve the device that a terminal has now. */
