@@ -126,16 +126,16 @@ def lock_error(memory: Memory, item: ControlItem, value: int) -> int:
 
     A Moving Speed with a direction bit is accepted in joint mode too [i]. The manual only has "0 ~ 1,023
     can be used", but pypot writes the bit to every motor with `orientation: indirect`, and Poppy moves."""
-    if item.name == "goal_position" and multi_turn_mode(memory):  # Counts turns, in two's complement
-        return ErrorBit.RANGE if abs(value - (value >> 15 << 16)) > _MULTI_TURN_GOAL else 0
     locked = memory.get("lock") == 1 and (not value if item.name == "lock" else item.area == "EEPROM")
     # e-Manual, Goal Torque (71): the value must not exceed Torque Limit.
     strong = item.name == "goal_torque" and value & _MAGNITUDE > memory["torque_limit"]
-    if locked or strong:
+    if item.name == "goal_position" and multi_turn_mode(memory):
+        value -= value >> 15 << 16  # Counts turns, in two's complement
+    lowest, highest = _range_of(memory, item)
+    if locked or strong or item.access != "RW" or not lowest <= value <= highest:
         return ErrorBit.RANGE
-    error = device_error(memory, item, value)
-    lowest, highest = _angle_limits(memory, item)
-    return error or (0 if lowest <= value <= highest else ErrorBit.ANGLE_LIMIT)
+    lowest, highest = _limits_of(memory, item)
+    return 0 if lowest <= value <= highest else ErrorBit.ANGLE_LIMIT
 
 
 def torque_error(memory: Memory, item: ControlItem, value: int) -> int:
@@ -152,8 +152,11 @@ def torque_error(memory: Memory, item: ControlItem, value: int) -> int:
 
 
 def _range_of(memory: Memory, item: ControlItem) -> Bounds:
-    """Return the values of an item that a servo of Protocol 2.0 has a meaning for, whatever its limits."""
+    """Return the values of an item that a servo has a meaning for, whatever its limits."""
     name, table = item.name, memory.table
+    if table.protocol == 1.0:
+        turns = name == "goal_position" and multi_turn_mode(memory)
+        return (-_MULTI_TURN_GOAL, _MULTI_TURN_GOAL) if turns else (item.minimum, item.maximum)
     one_turn = name == "goal_position" and _one_turn(memory)
     lowest, highest = item.minimum, item.maximum
     if one_turn:  # Also for a goal that only the position limits bound: those of Y span several turns
@@ -166,8 +169,10 @@ def _range_of(memory: Memory, item: ControlItem) -> Bounds:
 
 
 def _limits_of(memory: Memory, item: ControlItem) -> Bounds:
-    """Return the values of an item within the limits that the registers of a servo of Protocol 2.0 set."""
+    """Return the values of an item within the limits that the registers of a servo set."""
     name, table = item.name, memory.table
+    if table.protocol == 1.0:
+        return _angle_limits(memory, item)
     limit_name = ACCESS.limits.get(name, "")
     if name in ACCESS.limits_of_p and table.items["torque_enable"].address == TORQUE_ENABLE_OF_P:
         limit_name = ACCESS.limits_of_p[name]
@@ -186,15 +191,9 @@ def _angle_limits(memory: Memory, item: ControlItem) -> Bounds:
 
 
 def accepted_goals(memory: Memory, item: ControlItem) -> Bounds:
-    """Return the values of a goal that a servo accepts now without an error, all or some of them."""
-    if item.area == "EEPROM":  # Y, Profile Velocity: torque locks it
-        return NOTHING
-    if memory.table.protocol == 2.0:
-        ranges = _range_of(memory, item), _limits_of(memory, item)
-    elif multi_turn_mode(memory) or item.name == "goal_torque":
-        return NOTHING  # Two's complement, or a limit of the magnitude: not a range of integers on the wire
-    else:
-        ranges = (item.minimum, item.maximum), _angle_limits(memory, item)
+    """Return the values of a goal that a servo accepts now without an error, all or those that are not
+    negative."""
+    ranges = _range_of(memory, item), _limits_of(memory, item)
     return max(lowest for lowest, _ in ranges), min(highest for _, highest in ranges)
 
 

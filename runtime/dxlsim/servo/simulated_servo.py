@@ -54,7 +54,10 @@ class SimulatedServo(SimulatedNode):
         shaft.mechanics.watch_servo(shaft.index, self._strained)
         self._watch_identity()
         named = (memory.table.items.get(name) for name in sorted(ACCESS.goals | shaft.items.aims))
-        self._goals = [item for item in named if item is not None and item.access == "RW"]
+        # A goal in the EEPROM, Profile Velocity of Y, is locked by torque, which only Python checks.
+        self._goals = [
+            item for item in named if item is not None and (item.access, item.area) == ("RW", "RAM")
+        ]
         self._accepted = (GoalState * max(len(self._goals), 1))(
             *(GoalState(address=item.address, size=item.size, is_signed=item.signed) for item in self._goals)
         )
