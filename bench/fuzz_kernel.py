@@ -21,7 +21,6 @@ import hashlib
 import math
 import os
 import random
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -31,11 +30,11 @@ from dataclasses import dataclass
 from itertools import count, zip_longest
 from operator import itemgetter
 from pathlib import Path
-from zlib import crc32
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import numpy as np
+from bench.sanitizers import compile_sanitized, sanitizing_environment
 from msgspec.structs import replace
 from tests.kit.decoded import decode_packets
 
@@ -532,25 +531,6 @@ def campaign(
     return tally
 
 
-def sanitized(folder: str) -> dict[str, str]:
-    """Compile the kernel with the sanitizers of gcc; return the environment in which Python can load it."""
-    gcc, source, target = shutil.which("gcc") or "gcc", kernel.SOURCE, str(Path(folder, "libkernel.so"))
-    flags = ["-std=c11", "-O1", "-g", "-fPIC", "-shared", "-ffp-contract=off", "-fno-sanitize-recover=all"]
-    flags += ["-fsanitize=address,undefined", f"-DSOURCE_CRC={crc32(source.read_bytes())}u"]
-    subprocess.run([gcc, *flags, "-o", target, str(source), "-lm"], check=True)
-    found = [
-        subprocess.check_output([gcc, f"-print-file-name={name}"], text=True).strip()
-        for name in ("libasan.so", "libubsan.so")
-    ]
-    # CPython keeps memory until its end, which is no leak of the kernel
-    return {
-        **os.environ,
-        "LD_PRELOAD": " ".join(found),
-        "ASAN_OPTIONS": "detect_leaks=0",
-        LIBRARY: target,
-    }
-
-
 def main() -> None:
     """Run the campaign, in several processes by seeds that follow each other."""
     parser = argparse.ArgumentParser()
@@ -570,7 +550,10 @@ def main() -> None:
     seeds = range(chosen.seed, chosen.seed + chosen.processes)
     command = [sys.executable, __file__, str(share), *["--digests"] * chosen.digests, "--seed"]
     with tempfile.TemporaryDirectory() as folder:
-        environment = sanitized(folder) if chosen.sanitized else None
+        environment = None
+        if chosen.sanitized:
+            library = str(compile_sanitized(kernel.SOURCE, Path(folder)))
+            environment = {**sanitizing_environment(), LIBRARY: library}
         children = [subprocess.Popen([*command, str(seed)], env=environment) for seed in seeds]
         sys.exit(max(abs(child.wait()) for child in children))
 

@@ -170,6 +170,11 @@ def test_random_and_mutated_strings_do_no_harm_and_get_no_false_answer(protocol)
     assert tally.answers > 50
 
 
+@pytest.mark.parametrize("protocol", [1.0, 2.0])
+def test_motion_does_not_depend_on_the_times_at_which_the_mechanics_are_stepped(protocol):
+    fuzz_simulation.shake(protocol, 200, seed=7)
+
+
 @pytest.mark.parametrize(
     "model", ["AX-12A", "MX-64", "XM430-W350", "XL-320", "YM070-210-M001", "PH42-020-S300"]
 )
