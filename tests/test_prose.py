@@ -1,7 +1,4 @@
-"""Prose: docstrings, comments, messages and pages contain none of the phrases below.
-
-Each phrase has a plainer form. The list is the floor: a text without these phrases can still be hard to read.
-"""
+"""Prose: docstrings, comments, messages and pages contain none of the phrases below."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Every command and every example of the README does what the README has it do.
-
-What a shell and the processes of a run add is tried once; other commands run in this process.
-"""
+"""Every command and every example of the README does what the README has it do."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""The pages of the repository: the commands, files, names and pages in them exist.
-
-Each page with commands has a test that runs them, such as tests/cli/test_pages.py.
-"""
+"""The pages of the repository: the commands, files, names and pages in them exist."""
 
 from __future__ import annotations
 

@@ -1,8 +1,4 @@
-"""The programs of docs/how-to/recipes.md and the notebook, on simulated robots.
-
-The notebook's cell is executed in this process: a Jupyter kernel would be many packages more to install, and
-would run the same lines. What only waits for goals runs on virtual time.
-"""
+"""The programs of docs/how-to/recipes.md and the notebook, on simulated robots in this process."""
 
 from __future__ import annotations
 

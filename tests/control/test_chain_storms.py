@@ -1,7 +1,4 @@
-"""Random graphs of controllers, switched at random while some of them fail: the invariants of every cycle.
-
-CI tries 120 graphs; `pytest --campaign=release tests/control/test_chain_storms.py` tries more.
-"""
+"""Random graphs of controllers, switched while some of them fail: the invariants of every cycle."""
 
 from __future__ import annotations
 

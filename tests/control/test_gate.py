@@ -1,8 +1,4 @@
-"""The gate, judged by properties of its goals: over random commands, and on joints that follow them.
-
-The formulas here are those of motion, not those of gate.c: a fault of gate.c fails a test that says what is
-wrong. Durations of the cycles are not even.
-"""
+"""The gate, judged by formulas of motion and not by those of gate.c."""
 
 from random import Random
 

@@ -1,7 +1,4 @@
-"""Torque, reboots and registers that clients request, where a test answers for the servos.
-
-What clients request of simulated servos is in `tests/steering/torque.txt`.
-"""
+"""Torque, reboots and registers that clients request, where a test answers for the servos."""
 
 import numpy as np
 import pytest

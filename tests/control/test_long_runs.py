@@ -1,7 +1,4 @@
-"""Long runs on an injected clock: the phase, the account of all periods, each controller's own rate, memory.
-
-CI runs 12 000 cycles; `pytest --campaign=release tests/control/test_long_runs.py` runs a million.
-"""
+"""Long runs on an injected clock: the phase, all periods, each controller's own rate, memory."""
 
 import gc
 import sys

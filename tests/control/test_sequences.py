@@ -1,7 +1,4 @@
-"""Random sequences of steering: what is never allowed to happen, whatever a client asks for.
-
-CI runs a sample; `pytest --campaign=release tests/control/test_sequences.py` runs them all.
-"""
+"""Random sequences of steering: what is never allowed to happen, whatever a client asks for."""
 
 import numpy as np
 from hypothesis import given, settings

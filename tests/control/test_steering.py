@@ -1,7 +1,4 @@
-"""What only a loop with scripted servos shows of steering: exact and late cycles, the guardian, `on_hold`.
-
-What clients request and what comes of it is in `tests/steering`.
-"""
+"""What only a loop with scripted servos shows of steering: exact and late cycles, the guardian, `on_hold`."""
 
 import numpy as np
 import pytest

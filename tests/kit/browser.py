@@ -1,7 +1,4 @@
-"""A headless Chromium, driven over a pipe by the DevTools protocol.
-
-https://chromedevtools.github.io/devtools-protocol
-"""
+"""A headless Chromium, driven over a pipe by the DevTools protocol."""
 
 from __future__ import annotations
 

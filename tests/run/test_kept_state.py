@@ -1,9 +1,4 @@
-"""Kept state: what a controller keeps in one run it has in the next; whatever ends, a file is old or new.
-
-CI kills a writing process 4 times and the loop of a run once. The full campaign:
-
-    pytest --campaign=release tests/run/test_kept_state.py
-"""
+"""Kept state: what a controller keeps in one run it has in the next; whatever ends, a file is old or new."""
 
 from __future__ import annotations
 

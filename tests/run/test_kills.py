@@ -1,12 +1,4 @@
-"""Campaign: kill -9 of a process of a run at a random moment, set-up and shutdown included; never the servos.
-
-Judged by the simulated bus' ledger alone: every byte sent is a legal instruction, torque ends off on all
-servos, nothing switches it on again once it was cut. And: the log can be read, no process is left.
-
-CI runs 2 kills. The full campaign before a release; each kill prints its victim and moment:
-
-    pytest --campaign=release tests/run/test_kills.py -rA
-"""
+"""Campaign: kill -9 of a process of a run at a random moment, judged by the simulated bus' ledger alone."""
 
 from __future__ import annotations
 

@@ -4,10 +4,6 @@ One survivor of main process, guardian and loop takes torque off. Recorder and g
 Afterwards nothing of the run is left but processes that are stopped, or that wait for one that is, and
 `dxlrun stop` ends these. Torque must be off in time after the last hit on these three, not counting the time
 for which the kernel let emulator, survivors or this process wait for a processor. Each pair prints both.
-
-CI runs the first four; cases of ends.txt have hits on guardian and loop. All ordered pairs, before a release:
-
-    pytest --campaign=release tests/run/test_pairs.py -rP
 """
 
 from __future__ import annotations

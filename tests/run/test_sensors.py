@@ -1,9 +1,4 @@
-"""A sensor stops, sends NaN, its process is killed: what the loop's end of its slot makes of it.
-
-CI does it with the sensor's own process only; with all processes of a run, judged by its log and its servos:
-
-    pytest --campaign=night tests/run/test_sensors.py
-"""
+"""A sensor stops, sends NaN, its process is killed: what the loop's end of its slot makes of it."""
 
 from __future__ import annotations
 

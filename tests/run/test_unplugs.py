@@ -4,10 +4,6 @@ Everything is real but the servos: processes, pseudo-terminals, a link to each a
 by the simulated buses' ledger: the other bus goes on, one that is back is read again, the log has all bytes,
 and all servos end limp: by the loop, by the guardian when the loop is killed, or by the terminal's process
 when both are.
-
-CI pulls 2 times in one run. The full campaign before a release has ten pulls in each of ten runs:
-
-    pytest --campaign=release tests/run/test_unplugs.py
 """
 
 from __future__ import annotations

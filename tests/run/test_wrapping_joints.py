@@ -1,8 +1,4 @@
-"""Every standard controller that takes positions: a joint with `wrap: true` goes the shorter way.
-
-A joint for each way to command of each standard controller stands 2 deg before half a turn from a whole
-number of turns; clients ask for the place 2 deg further, written a turn lower. The simulated shafts judge.
-"""
+"""Every standard controller that takes positions: a joint with `wrap: true` goes the shorter way."""
 
 from __future__ import annotations
 
