@@ -8,8 +8,10 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping
 from functools import cache
-from importlib.metadata import Distribution, EntryPoint, entry_points
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from importlib.metadata import Distribution, EntryPoint
 
 GROUP = "dxlrun"
 PHYSICS_GROUP = "dxlrun.physics"
@@ -38,6 +40,9 @@ def distribution_name(publisher: str) -> str:
 @cache
 def _read(path: tuple[str, ...]) -> Mapping[str, tuple[InstalledPlugin, ...]]:
     """Read the plug-ins of all groups from the installed packages; `path` is only the key of the cache."""
+    # Imported here because it takes long, and some processes of a run look for no plug-ins.
+    from importlib.metadata import entry_points
+
     found = entry_points()
     groups = {group: found.select(group=group) for group in (GROUP, PHYSICS_GROUP)}
     publishers: dict[Distribution | None, str] = {None: "an unknown distribution"}

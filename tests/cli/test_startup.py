@@ -34,6 +34,15 @@ def forms(form):
     return [form, *(each for below in form.__subclasses__() for each in forms(below))]
 print(json.dumps([len(forms(Form)), [each.__name__ for each in forms(Form) if each.__pydantic_complete__]]))
 """
+THREADS = """
+import contextlib, io, json, os, sys
+from dxlrun.cli import main
+sys.argv = ["dxlrun", "--version"]
+with contextlib.redirect_stdout(io.StringIO()):
+    main()
+import numpy
+print(json.dumps(os.listdir("/proc/self/task")))
+"""
 LOOP = """
 import json, sys
 import dxlrun.run.loop_process
@@ -140,11 +149,17 @@ def test_monitors_bring_no_compiler_into_the_process_of_the_loop() -> None:
     assert beneath(imported, "yaml", "rich", "cyclopts", "dxlrun.cli", "dxlrun.remote.gateway") == set()
 
 
+def test_commands_start_no_thread_for_each_core(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where there is one core, numpy starts none."""
+    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
+    assert len(printed(THREADS)) == 1
+
+
 def test_guardian_needs_neither_numpy_nor_pydantic() -> None:
     """Each run waits until it is there."""
     imported = set(printed("import json, sys, dxlrun.run.guardian; print(json.dumps([*sys.modules]))"))
     assert "dxlrun.run.guardian" in imported
-    assert beneath(imported, "numpy", "pydantic", "yaml", "rich", "cyclopts") == set()
+    assert beneath(imported, "numpy", "pydantic", "yaml", "rich", "cyclopts", "importlib.metadata") == set()
 
 
 def test_every_name_is_there():

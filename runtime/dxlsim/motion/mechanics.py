@@ -10,7 +10,6 @@ import heapq
 import math
 from collections.abc import Callable
 from functools import partial
-from importlib.metadata import entry_points
 
 import msgspec
 import numpy as np
@@ -328,6 +327,9 @@ def plant_of(config: SimulationConfig) -> PlantMaker:
         InputError: MuJoCo is not installed, cannot load the URDF, or would move nothing.
     """
     if config.bodies is not None:
+        # Imported here because it takes long, and servos without bodies do not need it.
+        from importlib.metadata import entry_points
+
         (found,) = entry_points(group="dxlrun.physics", name="mujoco")  # In a package that is slow to import
         maker: PlantMaker = found.load()(config.bodies)
         return maker
