@@ -8,18 +8,20 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 from tests.kit.awaited import DEADLINE_S, until
-from tests.kit.wire import commands, taken_apart
+from tests.kit.wire import all_writes, commands, taken_apart
 
 from dxlrun import running
 from dxlsim.bus.ledger import read_ledger
 
 ROBOTS = Path(__file__).resolve().parents[2] / "robots"
 JOINT, SERVO = "right_elbow_joint", 4
-SERVOS = {1, 2, 3, 4, 5, 6, 20, 21}
+SERVOS = (1, 2, 3, 4, 5, 6, 20, 21)
+TORSO: Any = SimpleNamespace(protocol=1.0, servos=[SimpleNamespace(servo_id=servo) for servo in SERVOS])
 TORQUE_ENABLE, GOAL_POSITION = 24, 30
-BROADCAST = 254
 
 
 def copy_robots(place: Path) -> None:
@@ -94,18 +96,10 @@ class Run:
         return all(written[servo] == 0 for servo in SERVOS)
 
     def written(self, address: int) -> dict[int, int]:
-        """Return what was last written at an address of each servo (Protocol 1.0: WRITE and SYNC WRITE)."""
-        found: dict[int, int] = {}
-        for entry in read_ledger(self.ledger):
-            data = entry.data
-            if entry.direction != "in" or len(data) < 7:
-                continue
-            if data[4] == 0x03 and data[5] == address:
-                servos = SERVOS if data[2] == BROADCAST else {data[2]}
-                found |= dict.fromkeys(servos, int.from_bytes(data[6:-1], "little"))
-            elif data[4] == 0x83 and data[5] <= address < data[5] + data[6]:
-                size, offset = data[6] + 1, address - data[5] + 1
-                rows = [data[at : at + size] for at in range(7, len(data) - 1, size)]
-                width = 2 if address == GOAL_POSITION else 1
-                found |= {row[0]: int.from_bytes(row[offset : offset + width], "little") for row in rows}
-        return found
+        """Return what was last written at an address of each servo (Protocol 1.0)."""
+        width = 2 if address == GOAL_POSITION else 1
+        return {
+            servo: int.from_bytes(data[address - begin :][:width], "little")
+            for _, servo, begin, data in all_writes(read_ledger(self.ledger), TORSO)
+            if begin <= address < begin + len(data)
+        }
