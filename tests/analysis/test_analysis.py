@@ -62,9 +62,6 @@ def test_run_without_a_cycle_is_reported(write):
     assert "torso" in shown(report)
 
 
-# Cycles
-
-
 def test_wake_up_latency_is_that_of_the_records(write):
     late = [4, 4, 4, 62, 151, 1001, 20_001, 3]
     latency = analyze_log(write([Cycle(number, late=us) for number, us in enumerate(late)])).totals.latency
@@ -159,9 +156,6 @@ def test_without_known_limits_tracking_compares_with_the_goal_of_the_cycle_befor
     assert (head.rms_rad, head.invalid) == (None, 0)
 
 
-# Servos and events
-
-
 def test_servo_that_was_silent_is_named(write):
     packets = asked_and_answered(0)
     packets += [
@@ -211,9 +205,6 @@ def test_errors_gaps_and_a_log_without_end_are_reported(write):
     assert "ValueError: no" in shown(report)
     counts = {event.name: event.count for event in EVENTS.numbers_of(report)}
     assert counts == {"controller_fault": 1, "recorder_gap": 1, "loop_started": 1}
-
-
-# What is shown
 
 
 @pytest.mark.parametrize(("value", "text"), [(83.4, "83 us"), (16_949.0, "16.95 ms"), (2.5e6, "2.50 s")])

@@ -168,9 +168,6 @@ def test_a_host_that_uses_the_same_adapter_is_told_by_the_replies_to_it(count, i
     )
 
 
-# Losses
-
-
 def swings(losses: int, low: float, high: float, seed: int = 1) -> tuple[Any, Any]:
     """Time of a joint that swings by 60 deg, and its losses between two angles, by bins of 5 deg."""
     angle = 60 * np.sin(np.arange(5000) * 0.05)

@@ -153,9 +153,6 @@ def test_short_and_common_errors():
     assert findings(Joint(way=slow, position=since_fault(slow + 0.05, slow))) == []
 
 
-# Oscillation
-
-
 def shaking(swing: float, hertz: float) -> Floats:
     return since_fault(swing * np.cos(2 * math.pi * hertz * TIME), 0.0)
 
@@ -193,8 +190,6 @@ def test_joint_that_a_controller_moves_with_an_effort_shakes_around_its_referenc
     assert told(Joint(nowhere, position, effort=SWING, sought=position)) == []
     assert told(Joint(nowhere, position, torque=Torque.RELEASED, sought=SWING)) == []  # by hand
 
-
-# Jumps
 
 QUICK = {"logged": JointPlan("j0", -9.0, 9.0, None, top_speed=5.0)}
 SHIFT = 0.4 * np.exp(-np.maximum(TIME - 5.0, 0.0) / 0.1) * FAULT

@@ -74,9 +74,6 @@ def only(log: Log) -> JointTracking:
     return joint
 
 
-# Ways
-
-
 STEP = stepped(100, 10, 1.0)
 UNKNOWN_FIRST = np.where(np.arange(100) < 20, NAN, 1.0)
 READ_LATER = np.where((np.arange(100) >= 20) & (np.arange(100) < 23), NAN, 0.4)
@@ -219,9 +216,6 @@ def test_terminal_report_and_json_have_the_same_numbers(make):
     assert words in analyzed_page(log)[1]
 
 
-# Slices
-
-
 @pytest.fixture(scope="module")
 def torso(tmp_path_factory):
     path = tmp_path_factory.mktemp("torso") / "run.mcap"
@@ -273,9 +267,6 @@ def test_what_rests_for_very_long_is_kept_in_bounded_memory(monkeypatch):
         assert len(found.times) <= 76
     assert len(rested) > 100
     assert {rest.error_rad for rest in rested} == {0.01}
-
-
-# Delay
 
 
 NUMBER = np.arange(2000)

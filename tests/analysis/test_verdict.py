@@ -181,9 +181,6 @@ def test_simulated_bus_is_known_when_the_link_to_its_port_is_gone(write, tmp_pat
         assert plan_in(read_log(path)).is_simulated("main") is simulated
 
 
-# One verdict
-
-
 @pytest.fixture(scope="module")
 def storm(tmp_path_factory):
     """The log of a stormy run, in small chunks, with streams, pauses and refusals."""
@@ -236,26 +233,18 @@ def test_event_is_not_cut_where_a_slice_ends(write, monkeypatch):
     ]
 
 
-def test_page_and_json_and_run_have_the_same_verdict(storm, tmp_path):
-    from dxlrun_analysis.page.report_page import analyzed_page
-
+def test_json_and_run_have_the_same_verdict(storm, tmp_path):
     log, said = read_log(storm), judge_run(totals_of(storm))
     report = analyze(log)
     assert not said.good
     assert report.verdict == said
     shown = json.loads(json_text(report.numbers))["verdict"]
     assert (shown["good"], tuple(shown["sentences"])) == (said.good, said.sentences)
-    _, text = analyzed_page(log)
-    assert f"<h1>{said.findings[0].sentence}</h1>" in text
-    assert all(f"<p>{finding.sentence}" in text for finding in said.findings[1:])
 
     cut, data = tmp_path / "cut.mcap", storm.read_bytes()
     cut.write_bytes(data[: len(data) * 2 // 3])
     assert judge_run(totals_of(cut)) == analyze_log(cut).verdict
     assert any("log is incomplete" in sentence for sentence in judge_run(totals_of(cut)).sentences)
-
-
-# Falls
 
 
 def test_motion_that_a_controller_begins_is_not_one_of_clients(tmp_path):

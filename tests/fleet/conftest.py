@@ -1,12 +1,9 @@
 """Fixtures of fleets: keys and a file of a fleet, the agent that it has, and what is closed at the end."""
 
-from __future__ import annotations
-
 import os
 import signal
 import socket
 import subprocess
-from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -29,7 +26,7 @@ def free_port() -> int:
 
 
 @pytest.fixture
-def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def lab(tmp_path, monkeypatch):
     """The file of a fleet of one robot that an agent starts, and one whose network hangs; with all keys."""
     for name, place in (("XDG_CONFIG_HOME", "c"), ("XDG_RUNTIME_DIR", "r")):  # a socket's path has 107 bytes
         (tmp_path / place).mkdir(mode=0o700)
@@ -52,7 +49,7 @@ def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.fixture
-def agent(lab: Path) -> Iterator[subprocess.Popen[bytes]]:
+def agent(lab):
     """The agent of that file, which takes connections."""
     with subprocess.Popen([DXLRUN, "fleet", lab, "--serve", "lab3"], stdout=subprocess.DEVNULL) as process:
         until(lambda: NetworkLink(read_fleet(lab).agents["lab3"].address, "test").alive, "the agent")
@@ -64,7 +61,7 @@ def agent(lab: Path) -> Iterator[subprocess.Popen[bytes]]:
 
 
 @pytest.fixture
-def ends() -> Iterator[ExitStack]:
+def ends():
     """Close what is entered, at the test's end."""
     with ExitStack() as stack:
         yield stack

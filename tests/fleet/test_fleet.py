@@ -1,14 +1,10 @@
 """`dxlrun fleet`: rows of robots; files; an agent that starts what its own file has, for an admin."""
 
-from __future__ import annotations
-
 import io
 import os
-import random
 import re
 import shlex
 import socket
-import subprocess
 import time
 from contextlib import closing
 from functools import partial
@@ -21,7 +17,7 @@ import pytest
 from rich.console import Console
 from tests.kit.awaited import until
 from tests.kit.campaigns import campaign
-from tests.kit.commands import Dxlrun
+from tests.kit.commands import cases, play
 from tests.kit.fuzzed_http import Said, check_port_survives_fuzzing
 from tests.kit.pages import page_text
 
@@ -44,7 +40,7 @@ INFO = RobotInfo("joint", 50.0, False, None, 0, 0, (), {}, {}, {}, {}, {}, {}, (
 ADDRESS = Address("lab3", "127.0.0.1", 1)
 
 
-def test_a_long_error_takes_no_room_from_the_names() -> None:
+def test_a_long_error_takes_no_room_from_the_names():
     row = RobotStatus(
         "joint_7", "running", voltage=12.0, temperature=30.0, error="a packet was lost " * 20, log="x" * 90
     )
@@ -54,7 +50,7 @@ def test_a_long_error_takes_no_room_from_the_names() -> None:
         assert words in shown.getvalue()
 
 
-def test_the_last_error_stays_and_warnings_are_none(lab: Path) -> None:
+def test_the_last_error_stays_and_warnings_are_none(lab):
     """Of a run that begins, and has no cycle yet."""
 
     class Begins:
@@ -89,7 +85,7 @@ def test_the_last_error_stays_and_warnings_are_none(lab: Path) -> None:
         assert (view.seen().state, view.seen().reason) == ("unreachable", "no answer")
 
 
-def test_a_row_has_the_lowest_voltage_and_the_hottest_joint() -> None:
+def test_a_row_has_the_lowest_voltage_and_the_hottest_joint():
     class Runs:
         def info(self) -> object:
             return msgspec.to_builtins(INFO) | {"paused": True}
@@ -110,7 +106,7 @@ def test_a_row_has_the_lowest_voltage_and_the_hottest_joint() -> None:
     assert (seen.state, seen.voltage, seen.temperature, seen.hottest) == ("paused", 11.5, 41.0, "knee")
 
 
-def test_what_an_agent_answers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_an_agent_answers(tmp_path, monkeypatch):
     """It starts what its own file names, for an admin, once, also when another agent started it."""
     (tmp_path / "wait.py").write_text(
         "import sys\nprint(sys.argv[1:], flush=True)\nsys.stdin.read()\ninput()\n"
@@ -154,15 +150,8 @@ def test_what_an_agent_answers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 @campaign(ci=300, night=100_000, release=1_000_000)
 @pytest.mark.timeout(600)
 def test_agent_starts_nothing_without_the_role_admin_for_fuzzed_requests_either(
-    lab: Path,
-    agent: subprocess.Popen[bytes],
-    dxlrun: Dxlrun,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    *,
-    amount: float,
-    chance: random.Random,
-) -> None:
+    lab, agent, dxlrun, tmp_path, monkeypatch, *, amount, chance
+):
     authority.issue("bert", Role.COMMAND, 30, tmp_path / "bert" / "dxlrun" / "keys")
     authority.issue("looks", Role.OBSERVE, 30, tmp_path / "other" / "dxlrun" / "keys")
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "other"))
@@ -181,42 +170,19 @@ def test_agent_starts_nothing_without_the_role_admin_for_fuzzed_requests_either(
     assert not list(lab.parent.glob("*.out"))
 
 
-@pytest.mark.parametrize(
-    ("text", "words", "sentence"),
-    [
-        ("robots: {arm: lab3}", (), "lab.yaml:1:15: robots.arm: 'lab3' is not an address"),
-        ("robots: {arm: lab3:7}\nagent: {}", (), "lab.yaml:2:1"),
-        (
-            "robots: {}\nagents: {a: {address: h:1, starts: {arm: servo /dev/ttyUSB0 1}}}",
-            (),
-            "does not begin with a robot file",
-        ),
-        ("robots: {arm: lab3:7}", ("--start", "arm"), "no agent starts arm; add it to"),
-        ("robots: {arm: lab3:7}", ("--stop", "amr"), "did you mean arm?"),
-        ("robots: {arm: lab3:7}", ("--serve", "lab3"), "the fleet file has no agent lab3; its agents: none"),
-        (
-            "robots: {}\nagents: {a: {address: h:1, starts: {arm: arm.yaml}}}",
-            ("--serve", "a"),
-            "robot file ",
-        ),
-    ],
-)
-def test_what_is_wrong_with_a_file_is_one_sentence(
-    lab: Path, dxlrun: Dxlrun, text: str, words: tuple[str, ...], sentence: str
-) -> None:
-    lab.write_text(text)
-    said = dxlrun("fleet", lab, *words)
-    assert (said.code, len(said.errors)) == (1 if "--start" in words else 2, 1), said
-    assert sentence in said.errors[0]
+@pytest.mark.parametrize("case", cases(Path(__file__).with_name("refusals.txt")))
+def test_refused(lab, tmp_path, monkeypatch, dxlrun, case):
+    monkeypatch.chdir(tmp_path)
+    play(case, dxlrun)
 
 
-def test_a_quoted_argument_of_a_robot_keeps_its_space(tmp_path: Path) -> None:
+def test_a_quoted_argument_of_a_robot_keeps_its_space(tmp_path):
     file = tmp_path / "lab.yaml"
     file.write_text("robots: {}\nagents: {a: {address: h:1, starts: {arm: arm.yaml 'logs:=my logs'}}}\n")
     assert read_fleet(file).agents["a"].starts == {"arm": ("arm.yaml", "logs:=my logs")}
 
 
-def test_fleet_md_has_a_file_that_is_read_and_lines_that_can_be_typed(tmp_path: Path) -> None:
+def test_fleet_md_has_a_file_that_is_read_and_lines_that_can_be_typed(tmp_path):
     page = page_text("fleet.md")
     (text,) = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
     (tmp_path / "lab.yaml").write_text(text)

@@ -1,14 +1,12 @@
 """`dxlrun fleet` beside real runs: rows of robots that run, hang and are gone; the live table."""
 
-from __future__ import annotations
-
 import os
 import pty
 import re
 import signal
 import socket
 import subprocess
-from contextlib import ExitStack, closing
+from contextlib import closing
 from pathlib import Path
 from typing import TypeVar
 
@@ -40,12 +38,8 @@ def looked(dxlrun: Dxlrun, lab: Path) -> list[dict[str, str]]:
 
 @pytest.mark.timeout(600)
 def test_a_robot_is_started_seen_killed_and_seen_again_beside_one_that_hangs(
-    lab: Path,
-    agent: subprocess.Popen[bytes],
-    dxlrun: Dxlrun,
-    ends: ExitStack,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    lab, agent, dxlrun, ends, monkeypatch
+):
     monkeypatch.setattr("dxlrun_fleet.fleet._START_S", DEADLINE_S)
 
     def enter(one: Closing) -> Closing:
@@ -85,7 +79,7 @@ def test_a_robot_is_started_seen_killed_and_seen_again_beside_one_that_hangs(
     assert result_of(said.out) == [{"robot": "joint", "done": True, "text": "joint has ended"}]
 
 
-def test_the_live_table_ends_with_q(lab: Path) -> None:
+def test_the_live_table_ends_with_q(lab):
     ours, theirs = pty.openpty()
     with subprocess.Popen(
         [DXLRUN, "fleet", lab], stdin=theirs, stdout=theirs, env=os.environ | TERMINAL

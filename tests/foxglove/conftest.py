@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -12,7 +11,7 @@ if TYPE_CHECKING:
 
 
 @pytest.fixture
-def serve() -> Iterator[Callable[..., Served]]:
+def serve():
     from tests.foxglove.served import Served  # needs the extra
 
     served: list[Served] = []

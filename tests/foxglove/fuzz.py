@@ -1,7 +1,5 @@
 """Fuzzed frames on the port of viewers: valid ones that command something, mutants of them, and noise."""
 
-from __future__ import annotations
-
 import json
 import random
 import socket
@@ -10,6 +8,7 @@ from contextlib import suppress
 from urllib.parse import urlsplit
 
 from tests.foxglove.foreign import ForeignViewer
+from tests.kit.fuzzed_http import mutated
 from websockets.exceptions import ConnectionClosed
 
 SAID: tuple[dict[str, object], ...] = (
@@ -28,22 +27,6 @@ BODIES = (b"{}", b'{"deactivate": ["head"]}', b'{"joints": ["all"], "on": false,
 CALLS = [
     struct.pack("<BIII", 2, service, 1, 4) + b"json" + body for service in range(3) for body in BODIES
 ] + [struct.pack("<BI", 1, 1) + b"{}"]
-
-
-def mutated(data: bytes, draw: random.Random) -> bytes:
-    """Return bytes that differ a little."""
-    match draw.randrange(5):
-        case 0:
-            return data[: draw.randrange(len(data) + 1)]
-        case 1:
-            return data * draw.randrange(1, 5)
-        case 2:
-            return draw.randbytes(draw.randrange(60))
-        case _:
-            found = bytearray(data)
-            for _ in range(draw.randrange(1, 4)):
-                found[draw.randrange(len(found))] = draw.randrange(256)
-            return bytes(found)
 
 
 def fuzz(url: str, count: int, draw: random.Random) -> None:

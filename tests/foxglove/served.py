@@ -1,7 +1,5 @@
 """A server of viewers in this process, as `dxlrun foxglove` has one in its own."""
 
-from __future__ import annotations
-
 import asyncio
 import ssl
 import threading

@@ -1,9 +1,6 @@
 """What `dxlrun foxglove` refuses before it listens."""
 
-from __future__ import annotations
-
 import os
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -13,7 +10,7 @@ from dxlrun_foxglove.foxglove import foxglove
 
 
 @pytest.fixture(autouse=True)
-def no_robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def no_robot(tmp_path, monkeypatch):
     """No robot runs; what is refused leaves this process its share of the processor."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     before = os.nice(0)
@@ -21,7 +18,7 @@ def no_robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     assert os.nice(0) == before
 
 
-def test_the_network_is_served_with_tls_alone() -> None:
+def test_the_network_is_served_with_tls_alone():
     for address in ("10.0.0.1", "192.168.1.2", "::", "localhost"):
         with pytest.raises(InputError, match=r"needs TLS; add --cert"):
             foxglove(listen=address)
@@ -30,6 +27,6 @@ def test_the_network_is_served_with_tls_alone() -> None:
 
 
 @pytest.mark.needs("foxglove")
-def test_a_robot_has_to_run() -> None:
+def test_a_robot_has_to_run():
     with pytest.raises(DxlrunError, match="no running robot found"):
         foxglove()

@@ -1,18 +1,14 @@
 """The door: a foreign page, a wrong, old or missing token get nothing; half-open connections make room."""
 
-from __future__ import annotations
-
 import os
 import socket
 import ssl
 import subprocess
-from collections.abc import Callable
 from contextlib import ExitStack, suppress
-from pathlib import Path
 
 import pytest
 from tests.foxglove.foreign import ForeignViewer
-from tests.foxglove.served import PAGE, Served
+from tests.foxglove.served import PAGE
 from websockets.exceptions import ConnectionClosed, InvalidMessage, InvalidStatus
 
 from dxlrun import InputError
@@ -27,7 +23,7 @@ def refused(url: str, origin: str | None = None, subprotocol: str = "foxglove.we
     return caught.value.response.status_code
 
 
-def test_only_the_token_of_this_start_opens_the_door(serve: Callable[..., Served]) -> None:
+def test_only_the_token_of_this_start_opens_the_door(serve):
     before, served = serve(), serve()
     token = served.server.token
     for wrong in (before.server.token, "", token[:-1], token + "x", token.swapcase(), "%00", "é"):
@@ -44,25 +40,23 @@ def test_only_the_token_of_this_start_opens_the_door(serve: Callable[..., Served
 @pytest.mark.parametrize(
     "origin", ["https://evil.example", "http://127.0.0.1:8080", "null", "file://", PAGE + ":1"]
 )
-def test_a_foreign_page_gets_nothing_even_with_the_token(serve: Callable[..., Served], origin: str) -> None:
+def test_a_foreign_page_gets_nothing_even_with_the_token(serve, origin):
     served = serve()
     assert refused(served.url, origin) == 403
     assert refused(served.address("wrong"), origin) == 401
 
 
-def test_the_viewer_on_the_web_may_connect(serve: Callable[..., Served]) -> None:
+def test_the_viewer_on_the_web_may_connect(serve):
     with ForeignViewer(serve().url, "foxglove.sdk.v1", PAGE) as viewer:
         assert viewer.socket.subprotocol == "foxglove.sdk.v1"
 
 
-def test_another_protocol_is_refused(serve: Callable[..., Served]) -> None:
+def test_another_protocol_is_refused(serve):
     assert refused(serve().url, subprotocol="chat") == 400
 
 
 @pytest.mark.parametrize("with_tls", [False, True])
-def test_half_open_connections_make_room_for_a_viewer(
-    serve: Callable[..., Served], certificate: tuple[Path, Path], with_tls: bool
-) -> None:
+def test_half_open_connections_make_room_for_a_viewer(serve, certificate, with_tls):
     served = serve(tls=tls_of(*certificate) if with_tls else None)
     known = ssl.create_default_context(cafile=certificate[0]) if with_tls else None
     before = len(os.listdir("/proc/self/fd"))
@@ -83,7 +77,7 @@ def test_half_open_connections_make_room_for_a_viewer(
 
 
 @pytest.fixture(scope="module")
-def certificate(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+def certificate(tmp_path_factory):
     """Certificate and key of 127.0.0.1."""
     place = tmp_path_factory.mktemp("tls")
     cert, key = place / "cert.pem", place / "key.pem"
@@ -95,9 +89,7 @@ def certificate(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return cert, key
 
 
-def test_with_a_certificate_there_is_nothing_without_tls(
-    serve: Callable[..., Served], certificate: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_with_a_certificate_there_is_nothing_without_tls(serve, certificate, monkeypatch):
     monkeypatch.setattr(
         "dxlrun_foxglove.foxglove_server.OPENING_S", 120.0
     )  # a busy machine can need longer than 5 s

@@ -1,14 +1,12 @@
 """The foreign viewer reads the server of foxglove-sdk, too: the tests beside this one judge by it."""
 
-from __future__ import annotations
-
 import pytest
 from tests.foxglove.foreign import ForeignViewer
 
 foxglove = pytest.importorskip("foxglove", reason="the extra foreign brings it for Python 3.11")
 
 
-def test_the_viewer_of_the_tests_reads_the_server_of_foxglove_sdk() -> None:
+def test_the_viewer_of_the_tests_reads_the_server_of_foxglove_sdk():
     from foxglove import Capability, Service, ServiceSchema
 
     context = foxglove.Context()

@@ -1,15 +1,11 @@
 """A foreign viewer of a running robot: the log's bytes, and what it may change, judged by log and ledger."""
 
-from __future__ import annotations
-
-import os
 import random
 import re
 import signal
 import struct
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,6 +15,7 @@ from tests.foxglove import fuzz
 from tests.foxglove.foreign import ForeignViewer
 from tests.kit.awaited import DEADLINE_S, until
 from tests.kit.campaigns import campaign
+from tests.kit.fuzzed_http import memory
 from tests.kit.pages import page_text
 from tests.kit.torso import JOINT, SERVO, TORQUE_ENABLE, Run
 from websockets.exceptions import ConnectionClosed
@@ -26,7 +23,6 @@ from websockets.exceptions import ConnectionClosed
 import dxlrun
 
 COMMANDS = re.findall(r"^    dxlrun (foxglove.*)$", page_text("foxglove.md"), re.MULTILINE)
-PAGE = os.sysconf("SC_PAGE_SIZE")
 MAIN = "from dxlrun.cli import main; main()"
 ROBOT = "bioloid_torso_imu"
 LATCHED = {"/robot_description", "/tf_static"}
@@ -35,7 +31,7 @@ SPEED = "left_arm.speed"
 
 
 @pytest.fixture
-def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Run]:
+def run(tmp_path, monkeypatch):
     one = Run(tmp_path, record=True)
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     one.start()
@@ -49,14 +45,9 @@ class Started(NamedTuple):
     url: str
     process: int
 
-    @property
-    def memory(self) -> float:
-        """MB"""
-        return int(Path(f"/proc/{self.process}/statm").read_text().split()[1]) * PAGE / 1e6
-
 
 @pytest.fixture
-def started(run: Run) -> Iterator[list[Started]]:
+def started(run):
     """A server for each command of docs/how-to/foxglove.md; Ctrl-C ends them."""
     processes = [
         subprocess.Popen(
@@ -74,9 +65,7 @@ def started(run: Run) -> Iterator[list[Started]]:
 
 
 @campaign(ci=1000, night=100_000, release=1_000_000)
-def test_a_viewer_gets_the_logs_bytes_and_steers_only_with_control(
-    run: Run, started: list[Started], amount: float, chance: random.Random
-) -> None:
+def test_a_viewer_gets_the_logs_bytes_and_steers_only_with_control(run, started, amount, chance):
     looks, control = started
     with ForeignViewer(looks.url) as only_looks, ForeignViewer(control.url) as steers:
         assert (only_looks.first, steers.first) == ("serverInfo", "serverInfo")
@@ -133,12 +122,12 @@ def check_noise_is_harmless(looks: Started, frames: int, draw: random.Random) ->
     """Send fuzzed frames and handshakes without the token: a viewer still gets in, memory stays bounded."""
     fuzz.fuzz(looks.url, frames // 10, draw)
     fuzz.knock(looks.url, frames // 100, draw)
-    before = looks.memory
+    before = memory(looks.process)
     fuzz.fuzz(looks.url, frames, draw)
     fuzz.knock(looks.url, frames // 20, draw)
     with ForeignViewer(looks.url) as viewer:
         viewer.words("serverInfo")
-    assert looks.memory < before + 20.0, f"{before} MB before"
+    assert memory(looks.process) < before + 20.0, f"{before} MB before"
 
 
 def changes_parameters(only_looks: ForeignViewer, steers: ForeignViewer) -> None:

@@ -1,9 +1,8 @@
 """A viewer that is slow, or takes nothing: what waits for it does not grow."""
 
-from __future__ import annotations
-
 import asyncio
 import json
+from collections.abc import Callable
 from typing import Any, cast
 
 from websockets.asyncio.server import ServerConnection
@@ -18,11 +17,12 @@ CHANNEL = Channel(3, "/cycle", CYCLE, latched=False)
 class SlowConnection:
     """Takes a frame when it is let."""
 
-    def __init__(self) -> None:
+    def __init__(self, let: int = 0) -> None:
         self.taken: list[Any] = []
         self.aborted = 0
         self.transport = self
-        self.let = asyncio.Semaphore(0)
+        self.let = asyncio.Semaphore(let)
+        self.viewer = Viewer(cast("ServerConnection", self))
 
     def abort(self) -> None:
         self.aborted += 1
@@ -31,90 +31,69 @@ class SlowConnection:
         await self.let.acquire()
         self.taken.append(frame)
 
+    async def take_until(self, is_done: Callable[[], bool] = lambda: True) -> None:
+        """Let the viewer send until something is so."""
+        sending = asyncio.create_task(self.viewer.send_queued())
+        await asyncio.sleep(0)
+        while not is_done():
+            await asyncio.sleep(0)
+        sending.cancel()
 
-def test_the_oldest_messages_are_left_out_for_a_slow_viewer() -> None:
+
+def test_the_oldest_messages_are_left_out_for_a_slow_viewer():
     async def run() -> None:
-        connection = SlowConnection()
-        viewer = Viewer(cast("ServerConnection", connection))
-        viewer.subscriptions[3] = 7
-        most = MOST_BYTES // (1000 + 13)
-        sending = asyncio.create_task(viewer.send_queued())
-        for number in range(3 * most):
-            viewer.queue_message(CHANNEL, number, b"x" * 1000)
-        connection.let = asyncio.Semaphore(10**6)
-        await asyncio.sleep(0)
-        sending.cancel()
-        sending = asyncio.create_task(viewer.send_queued())
-        while len(connection.taken) < most + 1:
-            await asyncio.sleep(0)
-        await asyncio.sleep(0)
-        sending.cancel()
-        assert json.loads(connection.taken[0])["message"] == SLOW
-        numbers = [int.from_bytes(frame[5:13], "little") for frame in connection.taken[1:]]
-        assert numbers == list(range(2 * most, 3 * most))  # the newest, in order
-        for number in range(3 * most):  # a second time, which is reported again
-            viewer.queue_message(CHANNEL, number, b"x" * 1000)
-        sending = asyncio.create_task(viewer.send_queued())
-        while len(connection.taken) < 2 * most + 1:
-            await asyncio.sleep(0)
-        sending.cancel()
-        assert json.loads(connection.taken[most + 1])["message"] == SLOW
+        connection, most = SlowConnection(10**6), MOST_BYTES // (1000 + 13)
+        connection.viewer.subscriptions[3] = 7
+        for count in (most + 1, 2 * (most + 1)):  # a second time, which is reported again
+            for number in range(3 * most):
+                connection.viewer.queue_message(CHANNEL, number, b"x" * 1000)
+            await connection.take_until(lambda count=count: len(connection.taken) >= count)
+            slow, *newest = connection.taken[-most - 1 :]
+            assert json.loads(slow)["message"] == SLOW
+            numbers = [int.from_bytes(frame[5:13], "little") for frame in newest]
+            assert numbers == list(range(2 * most, 3 * most)), "in order"
         assert connection.aborted == 0
 
     asyncio.run(run())
 
 
-def test_a_viewer_that_keeps_up_gets_every_message() -> None:
+def test_a_viewer_that_keeps_up_gets_every_message():
     async def run() -> None:
-        connection = SlowConnection()
-        connection.let = asyncio.Semaphore(10**6)
-        viewer = Viewer(cast("ServerConnection", connection))
-        viewer.subscriptions[3] = 7
-        sending = asyncio.create_task(viewer.send_queued())
-        data = bytes(MOST_BYTES // 4)
+        connection = SlowConnection(10**6)
+        connection.viewer.subscriptions[3] = 7
         for number in range(10):
-            viewer.queue_message(CHANNEL, number, data)
-            while len(connection.taken) <= number:
-                await asyncio.sleep(0)
-        sending.cancel()
+            connection.viewer.queue_message(CHANNEL, number, bytes(MOST_BYTES // 4))
+            await connection.take_until(lambda number=number: len(connection.taken) > number)
         assert [frame for frame in connection.taken if isinstance(frame, str)] == [], "a warning"
         assert [int.from_bytes(frame[5:13], "little") for frame in connection.taken] == list(range(10))
 
     asyncio.run(run())
 
 
-def test_a_closed_plot_ends_its_own_subscription() -> None:
-    viewer = Viewer(cast("ServerConnection", SlowConnection()))
+def test_a_closed_plot_ends_its_own_subscription():
+    viewer, server = SlowConnection().viewer, FoxgloveServer("robot", (), control=False)
     viewer.subscriptions = {3: 7, 7: 3}
-    server = FoxgloveServer("robot", (), control=False)
-    server._process_frame(
-        viewer, cast("Any", None), json.dumps({"op": "unsubscribe", "subscriptionIds": [7]})
-    )
+    server._process_frame(viewer, cast("Any", None), '{"op": "unsubscribe", "subscriptionIds": [7]}')
     assert viewer.subscriptions == {7: 3}
 
 
-def test_a_viewer_that_takes_no_replies_is_gone() -> None:
+def test_a_viewer_that_takes_no_replies_is_gone():
     async def run() -> None:
         connection = SlowConnection()
-        viewer = Viewer(cast("ServerConnection", connection))
-        for _ in range(MOST_REPLIES):
-            viewer.reply("{}")
-        assert connection.aborted == 0
-        viewer.reply("{}")
+        for count in (MOST_REPLIES, 1):
+            assert connection.aborted == 0
+            for _ in range(count):
+                connection.viewer.reply("{}")
         assert connection.aborted == 1
 
     asyncio.run(run())
 
 
-def test_what_it_has_not_subscribed_to_does_not_wait() -> None:
+def test_what_it_has_not_subscribed_to_does_not_wait():
     async def run() -> None:
-        connection = SlowConnection()
-        viewer = Viewer(cast("ServerConnection", connection))
-        viewer.queue_message(CHANNEL, 0, b"x")
-        connection.let.release()
-        sending = asyncio.create_task(viewer.send_queued())
-        await asyncio.sleep(0)
-        sending.cancel()
+        connection = SlowConnection(1)
+        connection.viewer.queue_message(CHANNEL, 0, b"x")
+        await connection.take_until()
         assert not connection.taken
 
     asyncio.run(run())

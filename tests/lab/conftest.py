@@ -1,6 +1,6 @@
 """Rigs of virtual time, and a directory to run commands in."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -14,7 +14,7 @@ Rigs = Callable[[Path], Rig]
 
 
 @pytest.fixture
-def own_rig(tmp_path: Path) -> Iterator[Rigs]:
+def own_rig(tmp_path):
     """Return a function that makes a rig of a robot file; its log is in `tmp_path`."""
     rigs: list[Rig] = []
 
@@ -28,19 +28,19 @@ def own_rig(tmp_path: Path) -> Iterator[Rigs]:
 
 
 @pytest.fixture
-def arm(own_rig: Rigs) -> Rig:
+def arm(own_rig):
     """A rig of an arm with two joints in a chain of controllers."""
     return own_rig(ROBOTS / "effort_arm.yaml")
 
 
 @pytest.fixture
-def single(own_rig: Rigs) -> Rig:
+def single(own_rig):
     """A rig of one joint."""
     return own_rig(ROBOTS / "single_joint.yaml")
 
 
 @pytest.fixture
-def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def here(tmp_path, monkeypatch):
     """Work in a directory of the test, with the robots in it."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))

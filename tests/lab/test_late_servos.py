@@ -1,7 +1,5 @@
 """How long a loop waited for simulated servos, by their ledger: in its read, and behind its deadline."""
 
-from __future__ import annotations
-
 import pytest
 from tests.kit.made_logs import Cycle, Wire, made_log
 

@@ -120,9 +120,6 @@ def test_the_yardstick_skips_deadlines_that_passed_and_keeps_their_phase(tmp_pat
     buffer.close()
 
 
-# Conditions and blocks
-
-
 @pytest.mark.parametrize(
     ("compare", "policy", "expected"),
     [
@@ -173,9 +170,6 @@ def test_a_measurement_alternates_its_conditions(monkeypatch):
     found = settings(OTHER, FIFO, blocks=2)
     latency_measurement.measure_blocks(found, "", MagicMock(), MagicMock(), MagicMock())
     assert asked == [OTHER, FIFO, FIFO, OTHER]
-
-
-# Statistics
 
 
 @pytest.mark.parametrize("confidence", [0.5, 0.95, 0.999])
@@ -254,9 +248,6 @@ def test_a_block_that_was_broken_off_does_not_weigh_as_much_as_a_whole_one():
     assert cut[1].max_us == 900.0
     # with nothing whole it is better than nothing
     assert figures(found, [block(C, 0, [7.0])]).conditions[0].over_blocks["mean_us"].mean == 7.0
-
-
-# Log and page
 
 
 @pytest.fixture(scope="module")

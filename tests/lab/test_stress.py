@@ -1,7 +1,5 @@
 """The load on the machine: that it works, that it is told when it ends, and that nothing of it stays."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,15 +1,11 @@
 """A small robot's records, made as the loop makes them, runs of a whole robot, and a foreign decoder."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 from msgspec.structs import replace
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from rosbags.typesys.store import Typestore
 
 from dxlrun.channels.cycle import CycleLayout, CycleRecord
 from dxlrun.log import schemas
@@ -24,7 +20,7 @@ ROBOTS = Path(__file__).parents[2] / "robots"
 
 
 @pytest.fixture
-def header() -> LogHeader:
+def header():
     return LogHeader(
         robot="torso",
         joints=JOINTS,
@@ -41,12 +37,12 @@ def header() -> LogHeader:
 
 
 @pytest.fixture
-def layout(header: LogHeader) -> CycleLayout:
+def layout(header):
     return CycleLayout(header.joints, [controller.name for controller in header.controllers])
 
 
 @pytest.fixture
-def cycle(layout: CycleLayout) -> Callable[[int], bytes]:
+def cycle(layout):
     """Return the bytes of cycle `number`: published in even ones, joint 1 invalid in every third."""
     record = CycleRecord(layout)
 
@@ -71,18 +67,18 @@ def cycle(layout: CycleLayout) -> Callable[[int], bytes]:
 
 
 @pytest.fixture
-def path(tmp_path: Path) -> Path:
+def path(tmp_path):
     """Path of `log`."""
     return tmp_path / "run.mcap"
 
 
 @pytest.fixture
-def log(path: Path, header: LogHeader) -> LogWriter:
+def log(path, header):
     return LogWriter(path, header)
 
 
 @pytest.fixture(scope="session")
-def torso(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def torso(tmp_path_factory):
     """A folder with logs of the torso, whose head moves, for 2.5 s: `whole.mcap`, and `parts` of 1 s."""
     folder = tmp_path_factory.mktemp("torso")
     motion = ROBOTS / "motions/three_parts.yaml"
@@ -93,7 +89,7 @@ def torso(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def typestore() -> Typestore:
+def typestore():
     """Rosbags with our messages; the standard ones are its own, so that our texts are judged."""
     store = get_typestore(Stores.ROS2_HUMBLE)
     for message in (schemas.CYCLE, schemas.BUS_PACKETS, schemas.EVENT, schemas.COMMAND):

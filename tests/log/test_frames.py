@@ -1,9 +1,6 @@
 """/tf and /tf_static: what other programs read of them; rate, stamps, and what is unknown."""
 
-from __future__ import annotations
-
 import math
-import random
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -96,9 +93,7 @@ class Scene:
 
 @campaign(ci=10, night=200, release=1000)
 @pytest.mark.parametrize("path", sorted(ROBOTS.rglob("*.urdf")), ids=lambda path: path.stem)
-def test_poses_of_logged_frames_are_those_of_the_tree(
-    path: Path, amount: float, chance: random.Random
-) -> None:
+def test_poses_of_logged_frames_are_those_of_the_tree(path, amount, chance):
     urdf = read_urdf(path.read_text())
     moving = tuple(joint.name for joint in urdf.joints if joint.moves and joint.mimic is None)
     scene, tree = Scene(path.read_text(), moving), FrameTree(urdf, moving)
@@ -112,10 +107,7 @@ def test_poses_of_logged_frames_are_those_of_the_tree(
             assert np.abs(in_root(link, found) - expected).max() < ROUNDED, (link, positions)
 
 
-# A whole log
-
-
-def test_stamps_are_those_of_cycles_and_angles_those_of_the_joints(torso: Path) -> None:
+def test_stamps_are_those_of_cycles_and_angles_those_of_the_joints(torso):
     read, urdf = read_log(torso / "whole.mcap"), read_urdf(TORSO.read_text())
     cycles = {int(cycle["read_ns"]) + read.header.epoch_offset_ns: cycle for cycle in read.cycles}
     yaw = urdf.joint("head_yaw_joint")
@@ -133,7 +125,7 @@ def test_stamps_are_those_of_cycles_and_angles_those_of_the_joints(torso: Path) 
     assert np.ptp(angles) > 0.3
 
 
-def test_what_does_not_move_is_logged_once_and_kept_for_who_comes_later(torso: Path) -> None:
+def test_what_does_not_move_is_logged_once_and_kept_for_who_comes_later(torso):
     urdf = read_urdf(TORSO.read_text())
     for log in (torso / "whole.mcap", *sorted((torso / "parts").iterdir())):
         (fixed,) = decode_log(log, "/tf_static")
@@ -146,7 +138,7 @@ def test_what_does_not_move_is_logged_once_and_kept_for_who_comes_later(torso: P
         assert (profile["durability"], profile["history"], profile["depth"]) == (1, 1, 1)
 
 
-def test_rerun_shows_a_robot_that_moves(torso: Path) -> None:
+def test_rerun_shows_a_robot_that_moves(torso):
     """Its own reader finds the shapes of the body, and a tree of transforms that is whole and moves."""
     chunks = pytest.importorskip("rerun.chunk", reason=ONLY_311)
     rows: dict[tuple[str, str], list[list[float]]] = {}
@@ -173,9 +165,7 @@ def test_rerun_shows_a_robot_that_moves(torso: Path) -> None:
 
 
 @pytest.mark.parametrize(("rate", "counts"), [(0, {0}), (10, {4, 5}), (1000, {20})])
-def test_the_rate_is_that_of_the_file_and_never_above_the_loop(
-    rate: float, counts: set[int], path: Path
-) -> None:
+def test_the_rate_is_that_of_the_file_and_never_above_the_loop(rate, counts, path):
     text = (ROBOTS / "bioloid_torso.yaml").read_text()
     robot = path.with_name("robot.yaml")
     model = f"{{urdf: {TORSO}, frames_rate: {rate}}}"
@@ -190,7 +180,7 @@ def test_the_rate_is_that_of_the_file_and_never_above_the_loop(
 # What is unknown, and signs
 
 
-def test_a_joint_that_was_never_read_is_shown_when_it_is_and_stays_where_it_was() -> None:
+def test_a_joint_that_was_never_read_is_shown_when_it_is_and_stays_where_it_was():
     scene = Scene(TORSO.read_text(), ("left_elbow_joint", "head_yaw_joint"))
     assert scene.at({"left_elbow_joint": math.nan, "head_yaw_joint": math.nan}) is None
     first = transforms(scene.at({"head_yaw_joint": 0.5}))
@@ -204,7 +194,7 @@ def test_a_joint_that_was_never_read_is_shown_when_it_is_and_stays_where_it_was(
     assert ("neck_link", "head_link") in transforms(scene.still)
 
 
-def test_the_torso_turns_with_its_imu_from_when_that_is_known() -> None:
+def test_the_torso_turns_with_its_imu_from_when_that_is_known():
     scene = Scene(TORSO.read_text(), ("head_yaw_joint",), "imu")
     assert ("odom", "imu") not in transforms(scene.at({}))
     turned = Rotation.from_euler("xyz", [0.2, -0.3, 0.4])
@@ -219,7 +209,7 @@ def test_the_torso_turns_with_its_imu_from_when_that_is_known() -> None:
     assert ("odom", "imu") not in transforms(scene.at({}, (0.0, 0.0, 0.0, 0.0)))
 
 
-def test_quaternions_are_of_length_one_and_never_change_their_sign_at_once() -> None:
+def test_quaternions_are_of_length_one_and_never_change_their_sign_at_once():
     scene = Scene(TORSO.read_text(), ("head_yaw_joint",), "imu")
     last: dict[str, NDArray[np.float64]] = {}
     for number in range(220):
@@ -237,7 +227,7 @@ def test_quaternions_are_of_length_one_and_never_change_their_sign_at_once() -> 
             last[each.child_frame_id] = quaternion
 
 
-def test_a_robot_without_a_urdf_has_no_frames(header: LogHeader, path: Path) -> None:
+def test_a_robot_without_a_urdf_has_no_frames(header, path):
     assert header.robot_description is None
     LogWriter(path, replace(header, frames=FramesPlan(30))).close()
     assert schemas.LogTopic.FRAMES not in open_log(path).topics
@@ -254,7 +244,7 @@ TILTING = """\
 """
 
 
-def test_a_body_whose_imu_is_on_a_moving_link_stands_upright() -> None:
+def test_a_body_whose_imu_is_on_a_moving_link_stands_upright():
     """What the IMU measures is only how its link moves: `tilt` about y, and its mount about x."""
     scene = Scene(TILTING, ("tilt",), "imu")
     for angle in np.linspace(-1.5, 1.5, 7):

@@ -1,7 +1,5 @@
 """Identity: a log names the files, the code, the git revision and the machine of its run."""
 
-from __future__ import annotations
-
 import platform
 import subprocess
 import sys
@@ -32,7 +30,7 @@ def git(folder: Path, *arguments: str) -> str:
 
 
 @pytest.fixture
-def repository(tmp_path: Path) -> Path:
+def repository(tmp_path):
     """A robot file in a repository, committed."""
     (tmp_path / "robot.yaml").write_text("name: a\n")
     git(tmp_path, "init", "-q")
@@ -41,7 +39,7 @@ def repository(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_a_log_has_the_hash_of_each_file_of_its_run(torso: Path) -> None:
+def test_a_log_has_the_hash_of_each_file_of_its_run(torso):
     robot, motion = ROBOTS / "bioloid_torso.yaml", ROBOTS / "motions/three_parts.yaml"
     read = read_log(torso / "whole.mcap")
     record = read.metadata[IDENTITY_NAME]
@@ -61,7 +59,7 @@ def test_a_log_has_the_hash_of_each_file_of_its_run(torso: Path) -> None:
     assert platform.release() in record["kernel"]
 
 
-def test_included_and_motor_files_are_named_as_seen_from_the_robot_file(tmp_path: Path) -> None:
+def test_included_and_motor_files_are_named_as_seen_from_the_robot_file(tmp_path):
     (tmp_path / "robot").mkdir()
     part = tmp_path / "parts.yaml"
     part.write_text("loop: {rate: 50}\n")
@@ -78,7 +76,7 @@ def test_included_and_motor_files_are_named_as_seen_from_the_robot_file(tmp_path
     assert "git revision" not in record
 
 
-def test_git_says_which_revision_and_whether_a_file_it_has_was_changed(repository: Path) -> None:
+def test_git_says_which_revision_and_whether_a_file_it_has_was_changed(repository):
     revision = git(repository, "rev-parse", "HEAD")
     (repository / "logs").mkdir()
     (repository / "logs/run.mcap").write_text("a log next to the robot file is no change")
@@ -89,9 +87,7 @@ def test_git_says_which_revision_and_whether_a_file_it_has_was_changed(repositor
     assert git_state(repository, "other.yaml")["git changed"] == "yes"  # git does not have it
 
 
-def test_a_hook_of_another_repository_does_not_lead_elsewhere(
-    repository: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_hook_of_another_repository_does_not_lead_elsewhere(repository, tmp_path_factory, monkeypatch):
     other = tmp_path_factory.mktemp("other")
     git(other, "init", "-q")
     monkeypatch.setenv("GIT_DIR", str(other / ".git"))
@@ -99,9 +95,7 @@ def test_a_hook_of_another_repository_does_not_lead_elsewhere(
 
 
 @pytest.mark.parametrize("how", ["missing", "slow", "broken", "no commit"])
-def test_a_run_does_without_git(
-    how: str, repository: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_does_without_git(how, repository, tmp_path_factory, monkeypatch):
     commands = tmp_path_factory.mktemp("bin")
     if how == "no commit":
         git(repository, "update-ref", "-d", "HEAD")
@@ -115,7 +109,7 @@ def test_a_run_does_without_git(
     assert git_state(repository, "robot.yaml") == {}
 
 
-def test_another_byte_in_a_plug_in_is_another_hash(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_byte_in_a_plug_in_is_another_hash(tmp_path, monkeypatch):
     package = tmp_path / "waves"
     (package / "__pycache__").mkdir(parents=True)
     (package / "__init__.py").write_text("")
@@ -132,7 +126,7 @@ def test_another_byte_in_a_plug_in_is_another_hash(tmp_path: Path, monkeypatch: 
     assert package_of("plugin wave-robots wave.py") == ("wave", "wave-robots")
 
 
-def test_a_package_without_a_place_has_no_files(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_package_without_a_place_has_no_files(monkeypatch):
     monkeypatch.setitem(sys.modules, "from_memory", type(sys)("from_memory"))
     assert module_files("from_memory") == []
     assert module_files("not_installed_at_all") == []

@@ -1,7 +1,5 @@
 """The log: what goes in comes out, for us and for other people's tools, also from a full disk."""
 
-from __future__ import annotations
-
 import json
 import os
 import resource
@@ -23,10 +21,8 @@ from mcap.records import Chunk
 from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 from msgspec import structs
-from rosbags.typesys.store import Typestore
 from tests.kit.decoded import Decoded, decode_log
 
-from dxlrun.channels.cycle import CycleLayout
 from dxlrun.channels.event_records import (
     MOST_FAILED,
     Event,
@@ -43,7 +39,7 @@ from dxlrun.log import schemas
 from dxlrun.log.log_reader import read_log
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.reading import chunks
-from dxlrun.log.schemas import LogHeader, LogSummary, from_metadata, to_metadata
+from dxlrun.log.schemas import LogSummary, from_metadata, to_metadata
 from dxlwire.clock import VirtualClock
 from dxlwire.packets import PacketKind
 
@@ -73,9 +69,7 @@ def fill(log: LogWriter, cycle: Cycle, cycles: int = 10) -> LogSummary:
     return log.close()
 
 
-def test_everything_comes_back_as_it_was(
-    log: LogWriter, path: Path, header: LogHeader, layout: CycleLayout, cycle: Cycle
-) -> None:
+def test_everything_comes_back_as_it_was(log, path, header, layout, cycle):
     summary = fill(log, cycle)
     read = read_log(path)
     assert read.cycles.tobytes() == b"".join(cycle(number) for number in range(10))
@@ -98,9 +92,7 @@ def test_everything_comes_back_as_it_was(
     assert path.read_bytes() == before
 
 
-def test_other_tools_decode_every_topic(
-    log: LogWriter, path: Path, header: LogHeader, cycle: Cycle, typestore: Typestore
-) -> None:
+def test_other_tools_decode_every_topic(log, path, header, cycle, typestore):
     summary, by_topic = fill(log, cycle), dict[str, list[Decoded]]()
     for one in decode_log(path):
         assert (one.schema.encoding, one.channel.message_encoding) == ("ros2msg", "cdr")
@@ -125,9 +117,7 @@ def test_other_tools_decode_every_topic(
         assert unknown.tolist() == [[number % 3 == 0, False]] * 3
 
 
-def test_gap_is_an_event_and_counted_and_long_data_of_an_event_are_left_out(
-    log: LogWriter, path: Path
-) -> None:
+def test_gap_is_an_event_and_counted_and_long_data_of_an_event_are_left_out(log, path):
     ring = EventRing(Handover(log.write_record), VirtualClock(7))
     ring.emit_event("loop", EventBody(EventCode.STEERED, Severity.INFO, "too long"), b"x" * 5000)
     log.gap("loop/packets", 17)
@@ -141,7 +131,7 @@ def test_gap_is_an_event_and_counted_and_long_data_of_an_event_are_left_out(
     assert read.metadata["dxlrun_summary"]["gaps"] == "17"
 
 
-def test_failed_goals_of_clients_hide_none_of_a_motion_file(log: LogWriter) -> None:
+def test_failed_goals_of_clients_hide_none_of_a_motion_file(log):
     ring = EventRing(Handover(log.write_record), VirtualClock(7))
     ring.goals.planned = {"motion.yaml:7:5"}
     reports = [GoalReport(n, "arm", "trajectory", "a client", "missed") for n in range(MOST_FAILED + 50)]
@@ -166,14 +156,14 @@ def test_failed_goals_of_clients_hide_none_of_a_motion_file(log: LogWriter) -> N
         (None, "No such file"),
     ],
 )
-def test_what_is_no_log_is_refused_with_a_sentence(path: Path, content: bytes | None, sentence: str) -> None:
+def test_what_is_no_log_is_refused_with_a_sentence(path, content, sentence):
     if content is not None:
         path.write_bytes(content)
     with pytest.raises(LogError, match=sentence):
         read_log(path)
 
 
-def test_metadata_of_format_8_and_without_units_of_sources_are_read(header: LogHeader) -> None:
+def test_metadata_of_format_8_and_without_units_of_sources_are_read(header):
     text = to_metadata(structs.replace(header, source_units={"imu/voltage": "V"}))
     assert text["format"] == "9"
     assert from_metadata(text | {"format": "8"}) == from_metadata(text)
@@ -197,13 +187,7 @@ OTHER_FORMAT = "and this version reads formats 8 and 9 only; use the version of 
     ],
     ids=str,
 )
-def test_log_of_another_format_or_with_wrong_metadata_is_refused(
-    path: Path,
-    header: LogHeader,
-    monkeypatch: pytest.MonkeyPatch,
-    wrong: dict[str, str | None],
-    sentence: str,
-) -> None:
+def test_log_of_another_format_or_with_wrong_metadata_is_refused(path, header, monkeypatch, wrong, sentence):
     written = {name: value for name, value in (to_metadata(header) | wrong).items() if value is not None}
     monkeypatch.setattr("dxlrun.log.log_writer.to_metadata", lambda header: written)
     LogWriter(path, header).close()
@@ -213,11 +197,9 @@ def test_log_of_another_format_or_with_wrong_metadata_is_refused(
 
 # Chunks and attachments that are wrong, or that other tools wrote
 
-Rewritten = Callable[[Callable[[Chunk], object]], Path]
-
 
 @pytest.fixture
-def rewritten(log: LogWriter, path: Path, cycle: Cycle) -> Rewritten:
+def rewritten(log, path, cycle):
     """Write a log of four chunks, the third of which is changed by hand."""
 
     def rewritten(change: Callable[[Chunk], object]) -> Path:
@@ -260,9 +242,7 @@ TOO_LONG = "it is {} bytes long when decompressed, and 67108864 are read at most
     ],
     ids=["long", "longest", "rar", "long zstd", "long lz4"],
 )
-def test_chunk_that_cannot_be_read_is_left_out_without_much_memory(
-    rewritten: Rewritten, change: dict[str, object], why: str
-) -> None:
+def test_chunk_that_cannot_be_read_is_left_out_without_much_memory(rewritten, change, why):
     path = rewritten(lambda chunk: [setattr(chunk, *each) for each in change.items()])
     read_log(path)  # modules that are imported for it are not counted
     tracemalloc.start()
@@ -276,9 +256,7 @@ def test_chunk_that_cannot_be_read_is_left_out_without_much_memory(
     assert most < 10 << 20
 
 
-def test_file_becomes_only_so_many_times_as_long(
-    rewritten: Rewritten, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_file_becomes_only_so_many_times_as_long(rewritten, monkeypatch):
     monkeypatch.setattr(chunks, "_LARGEST", 2 << 20)
     monkeypatch.setattr(chunks, "_MOST_EXPANDED", 0)
     wrong = compressed("zstd", bytes(2 << 20)) | {"uncompressed_size": 2 << 20}
@@ -287,7 +265,7 @@ def test_file_becomes_only_so_many_times_as_long(
 
 
 @pytest.mark.parametrize("compression", ["lz4", ""])
-def test_log_that_another_tool_compressed_is_read(rewritten: Rewritten, compression: str) -> None:
+def test_log_that_another_tool_compressed_is_read(rewritten, compression):
     def change(chunk: Chunk) -> None:
         data = zstandard.decompress(chunk.data)
         chunk.data = lz4.frame.compress(data) if compression else data
@@ -297,7 +275,7 @@ def test_log_that_another_tool_compressed_is_read(rewritten: Rewritten, compress
     assert (log.cycles["cycle"].tolist(), log.complete) == ([0, 1, 2, 3], True)
 
 
-def test_long_attachment_is_compressed_and_comes_back(path: Path, header: LogHeader) -> None:
+def test_long_attachment_is_compressed_and_comes_back(path, header):
     plan = json.dumps(list(range(20_000))).encode()
     LogWriter(path, structs.replace(header, attachments={"plan.json": plan, "robot.yaml": b"r"})).close()
     with path.open("rb") as stream:
@@ -313,7 +291,7 @@ def test_long_attachment_is_compressed_and_comes_back(path: Path, header: LogHea
     [zstandard.compress(bytes(65 << 20)), zstandard.compress(bytes(range(256)) * 2000)[:-20], b"no zstd"],
     ids=["too long", "cut", "no zstd"],
 )
-def test_compressed_attachment_that_is_wrong_is_left_out(path: Path, header: LogHeader, data: bytes) -> None:
+def test_compressed_attachment_that_is_wrong_is_left_out(path, header, data):
     with path.open("wb") as stream:
         writer = Writer(stream)
         writer.start(schemas.PROFILE)
@@ -325,16 +303,13 @@ def test_compressed_attachment_that_is_wrong_is_left_out(path: Path, header: Log
     assert "a record of kind attachment cannot be read" in read.damage[0]
 
 
-def test_mode_that_is_none_is_reported(log: LogWriter, path: Path, cycle: Cycle, layout: CycleLayout) -> None:
+def test_mode_that_is_none_is_reported(log, path, cycle, layout):
     record = np.frombuffer(bytearray(cycle(7)), dtype=layout.dtype)
     record["mode"][0, 1] = 77
     log.write_record(RecordKind.CYCLE, record.tobytes())
     log.close()
     with pytest.raises(LogError, match="cycle 7 has an unknown mode of a servo"):
         read_log(path)
-
-
-# Disks and files
 
 
 @contextmanager
@@ -347,9 +322,7 @@ def files_of_at_most(size: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
-def test_full_disk_stops_the_writing_and_leaves_a_readable_log(
-    log: LogWriter, path: Path, cycle: Cycle
-) -> None:
+def test_full_disk_stops_the_writing_and_leaves_a_readable_log(log, path, cycle):
     log.write_record(RecordKind.CYCLE, cycle(0))
     log.finish_chunk()
     whole = path.stat().st_size
@@ -368,9 +341,7 @@ def test_full_disk_stops_the_writing_and_leaves_a_readable_log(
     assert (len(read.cycles), read.complete) == (1, False)
 
 
-def test_chunk_of_which_the_disk_takes_a_part_at_a_time_is_whole(
-    log: LogWriter, path: Path, cycle: Cycle, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_chunk_of_which_the_disk_takes_a_part_at_a_time_is_whole(log, path, cycle, monkeypatch):
     write = os.write
     monkeypatch.setattr(os, "write", lambda file, data: write(file, data[:100]))
     log.write_record(RecordKind.CYCLE, cycle(0))
@@ -378,7 +349,7 @@ def test_chunk_of_which_the_disk_takes_a_part_at_a_time_is_whole(
     assert read_log(path).complete
 
 
-def test_disk_that_is_full_at_the_end_is_reported(log: LogWriter, path: Path, cycle: Cycle) -> None:
+def test_disk_that_is_full_at_the_end_is_reported(log, path, cycle):
     log.write_record(RecordKind.CYCLE, cycle(0))
     with files_of_at_most(path.stat().st_size):
         summary = log.close()
@@ -387,7 +358,7 @@ def test_disk_that_is_full_at_the_end_is_reported(log: LogWriter, path: Path, cy
 
 
 @pytest.mark.parametrize("what", ["deleted", "moved", "replaced", "cut"])
-def test_file_that_is_gone_or_cut_is_reported(log: LogWriter, path: Path, cycle: Cycle, what: str) -> None:
+def test_file_that_is_gone_or_cut_is_reported(log, path, cycle, what):
     elsewhere = path.with_name("elsewhere.mcap")
     log.write_record(RecordKind.CYCLE, cycle(0))
     log.finish_chunk()
@@ -405,7 +376,7 @@ def test_file_that_is_gone_or_cut_is_reported(log: LogWriter, path: Path, cycle:
     assert log.close().error == "another program deleted or moved the file during the run"
 
 
-def test_the_urdf_comes_first_and_once(header: LogHeader, cycle: Cycle, path: Path) -> None:
+def test_the_urdf_comes_first_and_once(header, cycle, path):
     writer = LogWriter(path, structs.replace(header, robot_description="<robot name='körper'/>"))
     for number in range(3):
         writer.write_record(RecordKind.CYCLE, cycle(number))

@@ -1,7 +1,5 @@
 """Samples of the machine, by a fake /proc and /sys, and its load: each counts by the time that it covers."""
 
-from __future__ import annotations
-
 from math import isnan, nan
 from pathlib import Path
 from typing import Any
@@ -54,7 +52,7 @@ def sampled(root: Path, first: dict[str, str], then: dict[str, str]) -> Any:
     return Codec(schemas.MACHINE).unpack(data)
 
 
-def test_a_sample_has_what_changed_since_the_one_before(tmp_path: Path) -> None:
+def test_a_sample_has_what_changed_since_the_one_before(tmp_path):
     values = sampled(tmp_path, BEFORE, AFTER)
     assert (values["t_ns"], values["interval_ns"], values["loop_core"]) == (2 * 10**9, 10**9, 78)
     # core 0 in ticks of 100: user 20 + nice 10, system 10, irq 5, softirq 2, steal 23, idle 20 + iowait 10
@@ -74,7 +72,7 @@ def test_a_sample_has_what_changed_since_the_one_before(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("text", [None, "", "nonsense", "cpu0 1 x\n", "some\n", "0 0 1\n"])
 @pytest.mark.parametrize("name", list(BEFORE))
-def test_what_is_missing_or_damaged_is_not_a_number(tmp_path: Path, name: str, text: str | None) -> None:
+def test_what_is_missing_or_damaged_is_not_a_number(tmp_path, name, text):
     files = {key: value for key, value in BEFORE.items() if key != name or text is not None}
     values = sampled(tmp_path, files | ({name: text} if text is not None else {}), {})
     fields = {
@@ -87,28 +85,26 @@ def test_what_is_missing_or_damaged_is_not_a_number(tmp_path: Path, name: str, t
     assert all(np.isnan(np.atleast_1d(values[one])).any() for one in fields)
 
 
-def test_of_a_system_that_tells_nothing_all_is_not_a_number(tmp_path: Path) -> None:
+def test_of_a_system_that_tells_nothing_all_is_not_a_number(tmp_path):
     values = sampled(tmp_path, {}, {})
     assert values["loop_core"] == -1
     assert isnan(values["temperature"])
     assert len(values["user"]) == len(values["frequency"]) == 0
 
 
-def test_a_core_that_goes_offline_and_comes_back_is_not_a_number_between(tmp_path: Path) -> None:
+def test_a_core_that_goes_offline_and_comes_back_is_not_a_number_between(tmp_path):
     one = BEFORE | {"proc/stat": "cpu0 100 0 50 800 10 5 6 29 0 0\n"}
     values = sampled(tmp_path, BEFORE, one)
     assert np.isnan(values["user"]).all()
     assert len(values["user"]) == 2
 
 
-def test_virtual_runs_have_no_machine_and_stay_equal(tmp_path: Path) -> None:
+def test_virtual_runs_have_no_machine_and_stay_equal(tmp_path):
     for name in ("a", "b"):
         simulated_robot("robots/single_joint.yaml", duration_s=0.2, log=tmp_path / f"{name}.mcap").run()
     assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
     assert schemas.LogTopic.MACHINE not in read_log(tmp_path / "a.mcap").topics
 
-
-# Load
 
 SECOND = 10**9
 
@@ -137,18 +133,18 @@ def measured(*samples: LoadSample, begin_s: float = 0, end_s: float | None = Non
         ({"idle": 0, "waiting": 1}, "no core was idle in 1 of 2 s, the loop waited for a core in 1 of 2 s"),
     ],
 )
-def test_sample_is_busy_by_idle_cores_steal_and_waiting(busy: dict[str, float], text: str) -> None:
+def test_sample_is_busy_by_idle_cores_steal_and_waiting(busy, text):
     load = measured(sample(0, 1), sample(1, 2, **busy))
     assert (load.clause, load.busy_s, load.seconds) == (text, float(bool(text)), 2.0)
 
 
-def test_sample_counts_by_its_overlap_with_the_interval() -> None:
+def test_sample_counts_by_its_overlap_with_the_interval():
     load = measured(sample(0, 4, idle=0), sample(4, 5), sample(5, 6, idle=0), begin_s=3.5, end_s=5.2)
     assert load.clause == "no core was idle in 0.7 of 1.7 s, the recorder took no sample in 0.5 of 1.7 s"
     assert (load.busy_s, load.seconds) == pytest.approx((0.7, 1.7))
 
 
-def test_sample_outside_of_the_interval_does_not_count() -> None:
+def test_sample_outside_of_the_interval_does_not_count():
     assert measured(sample(0, 1, idle=0), sample(3, 4, idle=0), begin_s=1, end_s=3) == MachineLoad()
 
 
@@ -157,9 +153,7 @@ def test_sample_outside_of_the_interval_does_not_count() -> None:
     [(11, 0.1, True), (11, 0.6, False), (11, nan, True), (1.9, 0.1, False)],
     ids=["starved", "waited for its disk", "unknown", "a little late"],
 )
-def test_sampler_without_a_core_is_evidence_of_a_busy_machine(
-    length_s: float, idle: float, busy: bool
-) -> None:
+def test_sampler_without_a_core_is_evidence_of_a_busy_machine(length_s, idle, busy):
     """humanoid_20 at 1 kHz on two cores left one sample of 11 s, which began before the first deadline."""
     load = measured(sample(-5, length_s - 5, idle), begin_s=-2, end_s=6)
     assert load.too_busy is busy
@@ -168,20 +162,20 @@ def test_sampler_without_a_core_is_evidence_of_a_busy_machine(
 
 @pytest.mark.parametrize("gap_s", [1.9, 2.1])
 @pytest.mark.parametrize("before", [True, False])
-def test_seconds_without_a_sample_count_as_busy(gap_s: float, before: bool) -> None:
+def test_seconds_without_a_sample_count_as_busy(gap_s, before):
     sampled = sample(gap_s, gap_s + 1) if before else sample(0, 1)
     load = measured(sampled, end_s=gap_s + 1)
     assert load.silent_s == pytest.approx(gap_s if gap_s > 2 else 0)
     assert load.seconds == pytest.approx(1 + load.silent_s)
 
 
-def test_interval_without_any_sample_says_nothing() -> None:
+def test_interval_without_any_sample_says_nothing():
     assert measured(end_s=60) == MachineLoad()
     assert not MachineLoad().too_busy
     assert MachineLoad().share == 0
 
 
-def test_sample_that_is_shorter_than_the_steps_of_proc_stat_is_not_judged() -> None:
+def test_sample_that_is_shorter_than_the_steps_of_proc_stat_is_not_judged():
     assert measured(sample(0, 1), sample(1, 1.05, idle=0)) == MachineLoad(seconds=1.0)
 
 
@@ -189,14 +183,12 @@ def test_sample_that_is_shorter_than_the_steps_of_proc_stat_is_not_judged() -> N
     ("busy", "seconds", "share"),
     [(3, 3, 1.0), (3, 30, 0.1), (3, 31, 0.0), (2.9, 29, 0.0), (1, 2, 0.5), (0.9, 2, 0.0), (10, 40, 0.25)],
 )
-def test_machine_is_too_busy_from_a_tenth_and_3_s_or_half_of_the_interval_on(
-    busy: float, seconds: float, share: float
-) -> None:
+def test_machine_is_too_busy_from_a_tenth_and_3_s_or_half_of_the_interval_on(busy, seconds, share):
     load = MachineLoad(seconds, busy_s=busy)
     assert (load.share, load.too_busy) == (share, share > 0)
 
 
-def test_message_of_the_log_becomes_a_sample() -> None:
+def test_message_of_the_log_becomes_a_sample():
     shares = {name: np.zeros(2) for name in ("user", "system", "irq", "softirq")}
     values = shares | {"steal": np.array([nan, 0.2]), "idle": np.array([0.1, 0.3])}
     data = Codec(schemas.MACHINE).pack(

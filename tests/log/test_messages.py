@@ -12,7 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from rosbags.typesys.store import Typestore
 
 from dxlrun import Floats, messages
 from dxlrun.channels.cycle import SCALARS, SEQUENCES, CycleLayout, CycleRecord
@@ -87,14 +86,14 @@ def everything(**changed: Any) -> Everything:
 
 
 @pytest.mark.parametrize("kind", KNOWN, ids=lambda kind: kind.__name__)
-def test_a_known_message_is_the_published_one(kind: type, typestore: Typestore) -> None:
+def test_a_known_message_is_the_published_one(kind, typestore):
     declared = declared_message(kind, "nothing").type
     assert declared.name == kind.ros_type  # type: ignore[attr-defined]  # the list was filtered by it
     assert declared.type_hash == typestore.hash_rihs01(declared.name)
     read_by_rosbags(declared, declared_message(kind, "nothing").pack(kind(), (12, 34)))
 
 
-def test_an_own_message_is_read_by_rosbags_field_by_field() -> None:
+def test_an_own_message_is_read_by_rosbags_field_by_field():
     declared = declared_message(Everything, "my_robotics")
     assert declared.type.name == "my_robotics/msg/Everything"
     data = declared.pack(everything(), (12, 34))
@@ -154,7 +153,7 @@ OUTER = st.builds(
 
 @settings(max_examples=100, deadline=None)
 @given(OUTER)
-def test_nested_numbers_lie_where_rosbags_expects_them_behind_texts_of_any_length(message: Outer) -> None:
+def test_nested_numbers_lie_where_rosbags_expects_them_behind_texts_of_any_length(message):
     declared = declared_message(Outer, "mine")
     found = read_by_rosbags(declared.type, declared.pack(message, (0, 0)))
     for theirs, ours in ((found.one, message.one), (found.two, message.two)):
@@ -187,13 +186,13 @@ def test_nested_numbers_lie_where_rosbags_expects_them_behind_texts_of_any_lengt
         ("header", Time(), "header: Time given, Header expected"),
     ],
 )
-def test_a_value_that_does_not_fit_is_named_with_its_field(field: str, value: object, reason: str) -> None:
+def test_a_value_that_does_not_fit_is_named_with_its_field(field, value, reason):
     declared = declared_message(Everything, "my_robotics")
     with pytest.raises(WrongMessage, match=reason):
         declared.pack(everything(**{field: value}), (0, 0))
 
 
-def test_a_message_of_another_class_is_refused() -> None:
+def test_a_message_of_another_class_is_refused():
     with pytest.raises(WrongMessage, match="dict given, Part expected"):
         declared_message(Part, "mine").pack({"name": "x", "ratio": 0.1}, (0, 0))
 
@@ -247,13 +246,13 @@ class Odd:
         (Odd, "Odd.ros_type is 'Odd'"),
     ],
 )
-def test_what_ros_has_no_message_for_is_refused(kind: object, reason: str) -> None:
+def test_what_ros_has_no_message_for_is_refused(kind, reason):
     with pytest.raises(WrongMessage, match=reason) as refused:
         declared_message(kind, "mine")
     assert refused.value.fix
 
 
-def test_two_classes_of_one_name_are_refused() -> None:
+def test_two_classes_of_one_name_are_refused():
     other = dataclasses.make_dataclass("Part", [("ratio", float)])
     with pytest.raises(WrongMessage, match="two classes have the message name mine/msg/Part"):
         declared_message(made(one=Part, two=other), "mine")
@@ -268,7 +267,7 @@ def test_two_classes_of_one_name_are_refused() -> None:
         ("x", "x"),
     ],
 )
-def test_the_package_is_made_of_the_distribution(distribution: str, package: str) -> None:
+def test_the_package_is_made_of_the_distribution(distribution, package):
     assert package_of(distribution) == package
 
 
@@ -276,7 +275,7 @@ def test_the_package_is_made_of_the_distribution(distribution: str, package: str
 
 
 @pytest.mark.parametrize(("joints", "controllers"), [(0, 0), (1, 0), (3, 1), (8, 3)])
-def test_a_cycle_record_is_the_message_as_it_is(joints: int, controllers: int, typestore: Typestore) -> None:
+def test_a_cycle_record_is_the_message_as_it_is(joints, controllers, typestore):
     layout = CycleLayout([f"j{i}" for i in range(joints)], [f"c{i}" for i in range(controllers)])
     record = CycleRecord(layout)
     for number, (name, _) in enumerate(SCALARS):
@@ -308,7 +307,7 @@ def test_a_cycle_record_is_the_message_as_it_is(joints: int, controllers: int, t
         ({2: None, 3: None, 4: None}, "has the fields header, name"),
     ],
 )
-def test_values_that_do_not_fit_their_field_are_refused(wrong: dict[int, object], reason: str) -> None:
+def test_values_that_do_not_fit_their_field_are_refused(wrong, reason):
     codec = Codec(schemas.JOINT_STATE)
     good = [((0, 0), ""), ["a"], np.zeros(1), np.zeros(1), np.zeros(1)]
     codec.pack(*good)
@@ -318,7 +317,7 @@ def test_values_that_do_not_fit_their_field_are_refused(wrong: dict[int, object]
 
 
 @pytest.mark.parametrize("cut", [3, 10, 30, 41, -1])
-def test_a_cut_message_is_refused(cut: int) -> None:
+def test_a_cut_message_is_refused(cut):
     codec = Codec(schemas.EVENT)
     data = codec.pack(1, 2, 3, 0, "name", "source", "text", "{}")
     with pytest.raises(ValueError, match=r"Event|longer than its message"):

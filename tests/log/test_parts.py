@@ -1,7 +1,5 @@
 """A log in parts, split by size or time, all kept or the newest; read as a whole, and while it is written."""
 
-from __future__ import annotations
-
 import errno
 import os
 import random
@@ -20,7 +18,6 @@ from dxlrun.channels.ring import Handover, RecordKind
 from dxlrun.errors import LogError
 from dxlrun.log.log_file import LogFile
 from dxlrun.log.log_reader import Log, LogFollower, open_log, read_log
-from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.part_writer import PartWriter, open_writer
 from dxlrun.log.schemas import LogHeader
 from dxlrun.plan.recording_plan import PART_END_NAME, PART_NAME, RecordingPlan
@@ -74,16 +71,13 @@ class Run:
         return numbers(read_log(self.folder))
 
 
-Start = Callable[[RecordingPlan], Run]
-
-
 @pytest.fixture
-def start(tmp_path: Path, header: LogHeader, cycle: Callable[[int], bytes]) -> Start:
+def start(tmp_path, header, cycle):
     return lambda plan: Run(tmp_path / "run", header, cycle, plan)
 
 
 @pytest.fixture
-def four(start: Start) -> Path:
+def four(start):
     """Four whole parts of 175 cycles."""
     run = start(EACH_SECOND)
     run.cycles(0, 175)
@@ -99,7 +93,7 @@ def names(*parts: int) -> list[str]:
     return [f"part_{part:04d}.mcap" for part in parts]
 
 
-def test_split_by_time_loses_nothing_and_reads_as_one(start: Start) -> None:
+def test_split_by_time_loses_nothing_and_reads_as_one(start):
     run = start(EACH_SECOND)
     run.cycles(0, 175)
     run.event("over")
@@ -116,7 +110,7 @@ def test_split_by_time_loses_nothing_and_reads_as_one(start: Start) -> None:
     assert summary.bytes == sum(path.stat().st_size for path in run.parts)
 
 
-def test_split_by_size_ends_a_part_at_its_size(start: Start) -> None:
+def test_split_by_size_ends_a_part_at_its_size(start):
     run = start(RecordingPlan(split_bytes=20_000))
     run.cycles(0, 400, step=20)
     run.log.close()
@@ -124,7 +118,7 @@ def test_split_by_size_ends_a_part_at_its_size(start: Start) -> None:
     assert run.kept == list(range(400))
 
 
-def test_parts_whose_newest_record_is_too_old_are_deleted(start: Start) -> None:
+def test_parts_whose_newest_record_is_too_old_are_deleted(start):
     run = start(RecordingPlan(split_ns=SECOND, keep_ns=2 * SECOND))
     run.cycles(0, 3 * PER_SECOND)
     assert [path.name for path in run.parts] == names(0, 1, 2)
@@ -137,16 +131,14 @@ def test_parts_whose_newest_record_is_too_old_are_deleted(start: Start) -> None:
     assert (log.complete, log.damage, log.part) == (True, (), 7)
 
 
-def test_newest_part_is_kept_however_old_it_is(start: Start) -> None:
+def test_newest_part_is_kept_however_old_it_is(start):
     run = start(RecordingPlan(split_bytes=1 << 30, keep_ns=SECOND))
     run.cycles(0, 5 * PER_SECOND)
     run.log.close()
     assert run.kept == list(range(5 * PER_SECOND))
 
 
-def test_log_that_a_full_disk_ended_loses_no_older_part(
-    start: Start, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_log_that_a_full_disk_ended_loses_no_older_part(start, monkeypatch):
     run = start(RecordingPlan(split_ns=SECOND, keep_ns=2 * SECOND))
     run.cycles(0, 3 * PER_SECOND)
 
@@ -160,7 +152,7 @@ def test_log_that_a_full_disk_ended_loses_no_older_part(
     assert run.kept[0] == 0
 
 
-def test_part_that_cannot_be_deleted_stays(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_part_that_cannot_be_deleted_stays(start, monkeypatch):
     def refused(self: Path, missing_ok: bool = False) -> None:
         raise PermissionError(errno.EACCES, "Permission denied")
 
@@ -172,9 +164,7 @@ def test_part_that_cannot_be_deleted_stays(start: Start, monkeypatch: pytest.Mon
 
 
 @pytest.mark.parametrize("keep_ns", [None, SECOND])
-def test_account_of_a_log_without_its_first_parts_begins_with_what_is_there(
-    start: Start, keep_ns: int | None
-) -> None:
+def test_account_of_a_log_without_its_first_parts_begins_with_what_is_there(start, keep_ns):
     run = start(RecordingPlan(split_ns=SECOND, keep_ns=keep_ns))
     run.cycles(0, 5 * PER_SECOND)
     run.log.close()
@@ -190,7 +180,7 @@ def test_account_of_a_log_without_its_first_parts_begins_with_what_is_there(
     assert reader.damage == (() if keep_ns else ("part_0000.mcap to part_0002.mcap are missing",))
 
 
-def test_parts_of_a_robot_have_the_same_as_its_whole_log(torso: Path) -> None:
+def test_parts_of_a_robot_have_the_same_as_its_whole_log(torso):
     parts, whole = read_log(torso / "parts"), read_log(torso / "whole.mcap")
     assert parts.cycles.tobytes() == whole.cycles.tobytes()
     assert [*parts.packets] == [*whole.packets]
@@ -208,7 +198,7 @@ def test_parts_of_a_robot_have_the_same_as_its_whole_log(torso: Path) -> None:
         assert sum(1 for _ in decode_log(file)) == summary.statistics.message_count > 0
 
 
-def test_two_runs_on_virtual_time_keep_the_same_parts_to_the_bit(tmp_path: Path) -> None:
+def test_two_runs_on_virtual_time_keep_the_same_parts_to_the_bit(tmp_path):
     plan = plan_of(ROBOTS / "single_joint.yaml", duration_s=1)
     plan = replace(plan, recording=RecordingPlan(split_ns=SECOND // 4, keep_ns=SECOND // 8))
     for name in ("once", "again"):
@@ -229,7 +219,7 @@ def test_two_runs_on_virtual_time_keep_the_same_parts_to_the_bit(tmp_path: Path)
         ((3,), "the parts after part_0002.mcap are missing"),
     ],
 )
-def test_part_that_is_missing_is_damage(four: Path, removed: tuple[int, ...], sentence: str) -> None:
+def test_part_that_is_missing_is_damage(four, removed, sentence):
     for name in names(*removed):
         (four / name).unlink()
     log = read_log(four)
@@ -237,7 +227,7 @@ def test_part_that_is_missing_is_damage(four: Path, removed: tuple[int, ...], se
     assert len(log.cycles) > 60
 
 
-def test_other_files_in_the_directory_are_ignored(four: Path) -> None:
+def test_other_files_in_the_directory_are_ignored(four):
     (four / "notes.txt").write_text("a match")
     (four / "part_x.mcap").write_text("none of ours")
     (four / "part_0009.mcap").mkdir()
@@ -246,7 +236,7 @@ def test_other_files_in_the_directory_are_ignored(four: Path) -> None:
 
 
 @pytest.mark.parametrize("inside", ["", "other.mcap"])
-def test_directory_without_a_part_is_one_sentence(inside: str, tmp_path: Path) -> None:
+def test_directory_without_a_part_is_one_sentence(inside, tmp_path):
     if inside:
         (tmp_path / inside).write_text("")
     with pytest.raises(LogError, match=r"the directory has no log \(part_0000"):
@@ -258,14 +248,14 @@ def test_directory_without_a_part_is_one_sentence(inside: str, tmp_path: Path) -
     [("", "this is a pipe or a device"), ("/dev/zero", "this is a pipe"), ("x.mcap", "cannot be read: ")],
     ids=["pipe", "device", "circle"],
 )  # fmt: skip
-def test_pipe_or_device_is_one_sentence(target: str, sentence: str, tmp_path: Path) -> None:
+def test_pipe_or_device_is_one_sentence(target, sentence, tmp_path):
     path = tmp_path / "x.mcap"
     path.symlink_to(target) if target else os.mkfifo(path)
     with pytest.raises(LogError, match=f"x.mcap: {sentence}"):
         read_log(path)
 
 
-def test_empty_part_or_one_that_is_no_log_is_damage_and_the_others_are_read(four: Path) -> None:
+def test_empty_part_or_one_that_is_no_log_is_damage_and_the_others_are_read(four):
     (four / "part_0001.mcap").write_bytes(b"")
     (four / "part_0002.mcap").write_bytes(b"no log at all")
     log = read_log(four)
@@ -276,7 +266,7 @@ def test_empty_part_or_one_that_is_no_log_is_damage_and_the_others_are_read(four
     assert len(log.cycles) > 60
 
 
-def test_part_of_another_run_is_left_out(four: Path, tmp_path: Path, header: LogHeader) -> None:
+def test_part_of_another_run_is_left_out(four, tmp_path, header):
     open_writer(tmp_path / "other.mcap", replace(header, robot="other"), RecordingPlan()).close()
     shutil.copy(tmp_path / "other.mcap", four / "part_0002.mcap")
     log = read_log(four)
@@ -284,7 +274,7 @@ def test_part_of_another_run_is_left_out(four: Path, tmp_path: Path, header: Log
     assert log.header.robot == "torso"
 
 
-def test_part_that_was_cut_is_read_as_far_as_it_goes(four: Path) -> None:
+def test_part_that_was_cut_is_read_as_far_as_it_goes(four):
     part = four / "part_0001.mcap"
     part.write_bytes(part.read_bytes()[:-200])
     log = read_log(four)
@@ -296,9 +286,7 @@ def test_part_that_was_cut_is_read_as_far_as_it_goes(four: Path) -> None:
 
 
 @pytest.mark.parametrize("keep_ns", [None, SECOND])
-def test_follower_goes_from_part_to_part_also_when_older_ones_are_deleted(
-    start: Start, keep_ns: int | None
-) -> None:
+def test_follower_goes_from_part_to_part_also_when_older_ones_are_deleted(start, keep_ns):
     run = start(RecordingPlan(split_ns=SECOND, keep_ns=keep_ns))
     follower = LogFollower(run.folder)
     seen: list[int] = []
@@ -310,9 +298,7 @@ def test_follower_goes_from_part_to_part_also_when_older_ones_are_deleted(
 
 
 @pytest.mark.parametrize(("room", "parts"), [(0, [0]), (12_000, [0, 1])], ids=["opening", "within"])
-def test_full_disk_ends_the_log_with_whole_parts(
-    start: Start, monkeypatch: pytest.MonkeyPatch, room: int, parts: list[int]
-) -> None:
+def test_full_disk_ends_the_log_with_whole_parts(start, monkeypatch, room, parts):
     write, used = LogFile.write, 0
 
     def limited(self: LogFile, data: bytes | bytearray | memoryview) -> int:
@@ -338,7 +324,7 @@ def test_full_disk_ends_the_log_with_whole_parts(
 @pytest.mark.parametrize(
     ("kind", "sentence"), [(RecordKind.CYCLE, "buffer"), (RecordKind.TAGGED, "Expected")]
 )
-def test_record_that_is_none_is_refused_as_in_one_file(start: Start, kind: RecordKind, sentence: str) -> None:
+def test_record_that_is_none_is_refused_as_in_one_file(start, kind, sentence):
     run = start(EACH_SECOND)
     with pytest.raises(ValueError, match=sentence):
         run.log.write_record(kind, b"?")
@@ -349,7 +335,7 @@ def test_record_that_is_none_is_refused_as_in_one_file(start: Start, kind: Recor
 
 
 @pytest.fixture
-def written(log: LogWriter, path: Path, cycle: Callable[[int], bytes]) -> bytes:
+def written(log, path, cycle):
     """The bytes of a log with 400 cycles in 20 chunks and an event in each."""
     events = EventRing(Handover(log.write_record), VirtualClock())
     for number in range(400):
@@ -365,7 +351,7 @@ def written(log: LogWriter, path: Path, cycle: Callable[[int], bytes]) -> bytes:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_everything_comes_once_however_the_file_grows(written: bytes, tmp_path: Path, seed: int) -> None:
+def test_everything_comes_once_however_the_file_grows(written, tmp_path, seed):
     rng, path = random.Random(seed), tmp_path / "growing.mcap"
     begin = written.index(b"plan.json") + 2000
     ends = sorted(rng.randrange(begin, len(written)) for _ in range(30))
@@ -382,9 +368,7 @@ def test_everything_comes_once_however_the_file_grows(written: bytes, tmp_path: 
     assert texts == [f"cycle {number}" for number in range(19, 400, 20)]
 
 
-def test_follower_has_the_log_without_its_packets_and_misses_a_file_that_is_gone(
-    written: bytes, path: Path
-) -> None:
+def test_follower_has_the_log_without_its_packets_and_misses_a_file_that_is_gone(written, path):
     whole, follower = read_log(path), LogFollower(path)
     followed = follower.new()
     assert whole.cycles.tobytes() == followed.cycles.tobytes()

@@ -1,10 +1,4 @@
-"""Other programs open a log without a warning: whole, cut and split.
-
-mcap and mcap-ros2-support, rosbags, Rerun's own reader and check, foxglove-sdk, and the doctor of pymcap-cli,
-which is run as a program because its licence is the GPL.
-"""
-
-from __future__ import annotations
+"""Other programs open a log without a warning, whole, cut and split; pymcap-cli is a program (GPL)."""
 
 import json
 import os
@@ -35,7 +29,7 @@ ONLY_311 = "in the extra `test` on Python 3.11 only"
 
 
 @pytest.fixture
-def logs(torso: Path) -> list[Path]:
+def logs(torso):
     """A whole log with topics of controllers, and two parts of a split one."""
     return [torso / "whole.mcap", *sorted((torso / "parts").iterdir())[1:]]
 
@@ -56,14 +50,14 @@ def counted(path: Path) -> dict[str, int | None]:
     return {name: topic.count for name, topic in open_log(path).topics.items() if topic.count}
 
 
-def test_mcap_and_its_support_of_ros_2_decode_every_message(logs: list[Path]) -> None:
+def test_mcap_and_its_support_of_ros_2_decode_every_message(logs):
     for path in logs:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             assert Counter(one.topic for one in decode_log(path)) == counted(path)
 
 
-def test_rosbags_opens_it_as_a_bag_and_takes_each_message_by_its_definition(logs: list[Path]) -> None:
+def test_rosbags_opens_it_as_a_bag_and_takes_each_message_by_its_definition(logs):
     """Packed again it is the same bytes, and the hash of the definition is that of the channel."""
     for path in logs:
         counts = Counter[str]()
@@ -80,7 +74,7 @@ def test_rosbags_opens_it_as_a_bag_and_takes_each_message_by_its_definition(logs
         assert declared.keys() == counts.keys()
 
 
-def test_the_doctor_finds_nothing_but_what_is_wrong(logs: list[Path], tmp_path: Path) -> None:
+def test_the_doctor_finds_nothing_but_what_is_wrong(logs, tmp_path):
     pytest.importorskip("pymcap_cli", reason=ONLY_311)
     for path in logs[::2]:
         done = run("-c", PYMCAP, "doctor", "--format", "jsonl", path)
@@ -92,7 +86,7 @@ def test_the_doctor_finds_nothing_but_what_is_wrong(logs: list[Path], tmp_path: 
     assert run("-c", PYMCAP, "doctor", tmp_path / "cut.mcap").returncode != 0
 
 
-def test_rerun_checks_and_converts_it_without_a_warning(logs: list[Path], tmp_path: Path) -> None:
+def test_rerun_checks_and_converts_it_without_a_warning(logs, tmp_path):
     pytest.importorskip("rerun", reason=ONLY_311)
     for path in logs[::2]:
         converted = tmp_path / f"{path.stem}.rrd"
@@ -105,7 +99,7 @@ def test_rerun_checks_and_converts_it_without_a_warning(logs: list[Path], tmp_pa
         assert converted.stat().st_size > 10_000
 
 
-def test_foxglove_takes_its_channels_and_messages_as_they_are(logs: list[Path], tmp_path: Path) -> None:
+def test_foxglove_takes_its_channels_and_messages_as_they_are(logs, tmp_path):
     """The SDK only writes: what it writes of our schemas and messages has the same columns."""
     foxglove = pytest.importorskip("foxglove", reason=ONLY_311)
     path = logs[0]

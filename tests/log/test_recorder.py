@@ -1,7 +1,5 @@
 """The recorder: what the rings carry is in the log, whatever happens to its process."""
 
-from __future__ import annotations
-
 import json
 import os
 import resource
@@ -24,20 +22,14 @@ from tests.kit.awaited import DEADLINE_S
 
 from dxlrun.channels import ring
 from dxlrun.channels.child_processes import LateMetadata, LoopRuns, MessageChannel
-from dxlrun.channels.cycle import CycleLayout
 from dxlrun.channels.event_records import LONGEST_EVENT, EventBody, EventCode, EventRing, Severity
 from dxlrun.channels.logged_packets import LONGEST_BATCH, PacketBatch
 from dxlrun.channels.ring import RecordKind, RingWriter, record_size
 from dxlrun.log.log_reader import read_log
 from dxlrun.log.recorder import _MOST_PER_TURN, REQUESTS, Recorder
-from dxlrun.log.schemas import CycleSpan, LogHeader, LogTopic, RecorderJob
+from dxlrun.log.schemas import CycleSpan, LogTopic, RecorderJob
 from dxlwire.clock import VirtualClock
 from dxlwire.packets import PacketKind
-
-Cycle = Callable[[int], bytes]
-
-
-# In this process
 
 
 @dataclass
@@ -53,7 +45,7 @@ Make = Callable[..., Any]
 
 
 @pytest.fixture
-def inside(path: Path, header: LogHeader, layout: CycleLayout) -> Make:
+def inside(path, header, layout):
     """Make a recorder of rings with so many cycles."""
 
     @contextmanager
@@ -73,9 +65,7 @@ def inside(path: Path, header: LogHeader, layout: CycleLayout) -> Make:
     return inside
 
 
-def test_record_that_is_torn_or_of_another_robot_is_declared_not_written(
-    inside: Make, path: Path, cycle: Cycle
-) -> None:
+def test_record_that_is_torn_or_of_another_robot_is_declared_not_written(inside, path, cycle):
     with inside() as one:
         (writer,) = one.writers
         writer.append(RecordKind.CYCLE, b"short")
@@ -91,8 +81,8 @@ def test_record_that_is_torn_or_of_another_robot_is_declared_not_written(
     ("kept", "lost"), [(10, 90), (2 * _MOST_PER_TURN + 1000, 0), (2 * _MOST_PER_TURN, 7)]
 )
 def test_what_waits_at_the_end_is_drained_and_what_was_overwritten_is_declared(
-    inside: Make, path: Path, cycle: Cycle, kept: int, lost: int
-) -> None:
+    inside, path, cycle, kept, lost
+):
     """A recorder that was stopped while it was behind: two turns and a half may be in the ring."""
     with inside(kept) as one:
         record = cycle(0)
@@ -109,9 +99,7 @@ def test_what_waits_at_the_end_is_drained_and_what_was_overwritten_is_declared(
     assert log.metadata["grants"] == {"loop": "none"}
 
 
-def test_machine_is_measured_from_the_begin_of_the_loop_to_its_end(
-    inside: Make, path: Path, cycle: Cycle
-) -> None:
+def test_machine_is_measured_from_the_begin_of_the_loop_to_its_end(inside, path, cycle):
     turns: list[int] = []
     with inside() as one:
 
@@ -133,9 +121,7 @@ def test_machine_is_measured_from_the_begin_of_the_loop_to_its_end(
     assert closed.start_up_load.seconds == 0
 
 
-def test_recorder_that_is_short_of_processor_time_flushes_every_half_second(
-    inside: Make, path: Path, cycle: Cycle, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_recorder_that_is_short_of_processor_time_flushes_every_half_second(inside, path, cycle, monkeypatch):
     """Each record takes 20 ms, four hundred times as long as usual, and 750 wait in three rings."""
     clock, flushed = VirtualClock(0), list[int]()
     module = SimpleNamespace(monotonic=lambda: clock.now_ns() / 1e9, monotonic_ns=clock.now_ns)
@@ -187,7 +173,7 @@ Start = Callable[[], Recording]
 
 
 @pytest.fixture
-def start(path: Path, header: LogHeader, layout: CycleLayout, cycle: Cycle) -> Iterator[Start]:
+def start(path, header, layout, cycle):
     """Start a recorder whose first cycle is there before it is ready."""
     descriptors: list[int] = []
     started: list[Recording] = []
@@ -227,9 +213,7 @@ def start(path: Path, header: LogHeader, layout: CycleLayout, cycle: Cycle) -> I
 
 
 @pytest.mark.parametrize("end", ["Finish", "SIGTERM", "the supervisor is gone"])
-def test_what_the_rings_carry_is_in_the_log_byte_for_byte_and_ctrl_c_is_ignored(
-    start: Start, cycle: Cycle, end: str
-) -> None:
+def test_what_the_rings_carry_is_in_the_log_byte_for_byte_and_ctrl_c_is_ignored(start, cycle, end):
     recording = start()
     assert next(recording.lines) == {"type": "Ready"}
     recording.process.send_signal(signal.SIGINT)
@@ -257,7 +241,7 @@ def test_what_the_rings_carry_is_in_the_log_byte_for_byte_and_ctrl_c_is_ignored(
     assert log.complete
 
 
-def test_after_a_kill_the_log_is_readable_up_to_the_last_flush(start: Start, cycle: Cycle) -> None:
+def test_after_a_kill_the_log_is_readable_up_to_the_last_flush(start, cycle):
     recording = start()
     assert next(recording.lines) == {"type": "Ready"}
     for number in range(1, 20):
@@ -275,7 +259,7 @@ def test_after_a_kill_the_log_is_readable_up_to_the_last_flush(start: Start, cyc
     assert log.cycles.tobytes() == b"".join(cycle(number) for number in range(20))
 
 
-def test_full_disk_is_reported_once_and_the_rings_are_drained_on(start: Start, cycle: Cycle) -> None:
+def test_full_disk_is_reported_once_and_the_rings_are_drained_on(start, cycle):
     recording = start()
     assert next(recording.lines) == {"type": "Ready"}
     limit = (recording.path.stat().st_size, resource.RLIM_INFINITY)
@@ -294,7 +278,7 @@ def test_full_disk_is_reported_once_and_the_rings_are_drained_on(start: Start, c
     assert not read_log(recording.path).complete
 
 
-def test_log_that_cannot_be_created_is_reported(start: Start, path: Path) -> None:
+def test_log_that_cannot_be_created_is_reported(start, path):
     path.write_bytes(b"precious")
     recording = start()
     assert "cannot be written" in next(recording.lines)["sentence"]

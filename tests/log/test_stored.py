@@ -8,7 +8,6 @@ from rich.prompt import Confirm
 from tests.kit.answers import result_of
 from tests.kit.held_logs import being_written
 
-from dxlrun.cli import main
 from dxlrun.cli import run as cli_run
 from dxlrun.cli.run import _disk_lines
 from dxlrun.log import stored
@@ -97,15 +96,15 @@ def test_a_run_names_the_size_of_its_log_and_keeps_what_its_robot_file_says(logs
     assert (logs / "thesis.mcap").exists()
 
 
-def test_pruning_shows_asks_and_deletes_only_after_a_yes(logs, monkeypatch, capsys):
-    assert main(["logs", "logs", "--prune", "--keep", "0.1kB", "--json"]) == 0
-    assert len(result_of(capsys.readouterr().out)["oldest"]) == 3
-    assert main(["logs", "logs", "--prune", "--keep", "0.1kB"]) == 2
-    assert "nothing was deleted" in capsys.readouterr().err
+def test_pruning_shows_asks_and_deletes_only_after_a_yes(logs, monkeypatch, dxlrun):
+    """Wrong words are in tests/cli/refusals.txt."""
+    prune = ("logs", "logs", "--prune", "--keep")
+    assert len(result_of(dxlrun(*prune, "0.1kB", "--json").out)["oldest"]) == 3
+    said = dxlrun(*prune, "0.1kB")
+    assert (said.code, "nothing was deleted" in said.err) == (2, True)
     monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
     for answer, left in ((False, 4), (True, 1)):
         monkeypatch.setattr(Confirm, "ask", lambda *_, answer=answer, **__: answer)
-        assert main(["logs", "logs", "--prune", "--keep", "0.1kB"]) == 0
+        assert dxlrun(*prune, "0.1kB").code == 0
         assert len(stored.stored_logs(logs)) == left
-    assert main(["logs", "logs", "--prune", "--keep", "1 GB"]) == 0
-    assert "nothing to delete" in capsys.readouterr().out
+    assert "nothing to delete" in dxlrun(*prune, "1 GB").out

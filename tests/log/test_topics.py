@@ -1,12 +1,8 @@
 """Topics of controllers, inputs and diagnostics in the log: other programs decode them without our code."""
 
-from __future__ import annotations
-
 import json
 import re
-from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,7 +17,6 @@ from dxlrun.channels.ring import Handover, RecordKind
 from dxlrun.channels.topic_messages import MessageRing, PublishedTopic
 from dxlrun.log import schemas
 from dxlrun.log.log_reader import open_log, read_log
-from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.packing.diagnostics import Diagnostics
 from dxlrun.messages import Header, Odometry
 from dxlrun.messages.cdr import Codec
@@ -30,7 +25,6 @@ from dxlrun_analysis.report import analyze_log, tables
 from dxlwire.modes import Mode
 
 PERIOD_NS = 20_000_000
-Cycle = Callable[[int], bytes]
 
 
 @dataclass
@@ -42,7 +36,7 @@ class WaveState:
 
 
 @pytest.fixture
-def waves(log: LogWriter, path: Path, cycle: Cycle) -> Path:
+def waves(log, path, cycle):
     """50 cycles with messages of two topics, one in every fifth; the first one has nothing in its arrays."""
     ring, offset_ns = MessageRing(Handover(log.write_record)), log.header.epoch_offset_ns
     kinds = {"state": declared_message(WaveState, "my_robotics"), "odometry": declared_message(Odometry, "")}
@@ -67,7 +61,7 @@ def waves(log: LogWriter, path: Path, cycle: Cycle) -> Path:
     return path
 
 
-def test_mcap_ros2_decodes_every_message(waves: Path) -> None:
+def test_mcap_ros2_decodes_every_message(waves):
     of: dict[str, list[Any]] = {}
     for one in decode_log(waves, "/wave/state", "/wave/odometry"):
         of.setdefault(f"{one.topic} {one.schema.name}", []).append(one.message)
@@ -83,7 +77,7 @@ def test_mcap_ros2_decodes_every_message(waves: Path) -> None:
     assert odometry[-1].pose.covariance[35] == 0.5
 
 
-def test_our_reader_has_messages_times_columns_and_slices(waves: Path) -> None:
+def test_our_reader_has_messages_times_columns_and_slices(waves):
     read = read_log(waves)
     states = read.messages("/wave/state")
     assert (states[0]["names"], states[2]["names"]) == ([], ["pan", "tilt"])
@@ -112,7 +106,7 @@ def test_our_reader_has_messages_times_columns_and_slices(waves: Path) -> None:
         ("/wave/states", "", "no topic /wave/states; did you mean /wave/state?"),
     ],
 )
-def test_what_a_log_does_not_have_is_one_sentence(waves: Path, topic: str, field: str, reason: str) -> None:
+def test_what_a_log_does_not_have_is_one_sentence(waves, topic, field, reason):
     read = read_log(waves)
     with pytest.raises(LogError, match=re.escape(reason)):
         read.topics[topic].column(field) if field else read.messages(topic)
@@ -132,9 +126,7 @@ TAKEN = (
 )
 
 
-def test_inputs_come_back_as_they_were_and_another_reader_decodes_them(
-    log: LogWriter, path: Path, cycle: Cycle
-) -> None:
+def test_inputs_come_back_as_they_were_and_another_reader_decodes_them(log, path, cycle):
     log.write_record(RecordKind.CYCLE, cycle(-1))
     ring = CommandRing(Handover(log.write_record))
     for number in range(5):
@@ -159,7 +151,7 @@ def test_inputs_come_back_as_they_were_and_another_reader_decodes_them(
 
 
 @pytest.mark.parametrize("data", [b'{"a": "\xff"}', b"\xfe", b""])
-def test_what_was_no_json_is_none_in_the_log(log: LogWriter, path: Path, data: bytes) -> None:
+def test_what_was_no_json_is_none_in_the_log(log, path, data):
     CommandRing(Handover(log.write_record)).record_command(replace(STEERING, data=data))
     log.close()
     read = read_log(path)
@@ -172,7 +164,7 @@ def test_what_was_no_json_is_none_in_the_log(log: LogWriter, path: Path, data: b
 # How each servo is, in words that any ROS tool shows
 
 
-def test_each_joint_has_the_status_of_its_servo_once_a_second() -> None:
+def test_each_joint_has_the_status_of_its_servo_once_a_second():
     record = CycleRecord(CycleLayout(("elbow", "wheel", "head"), ()))
     states = record.states
     states.temperature[:] = 41.0, np.nan, 70.0

@@ -1,9 +1,6 @@
 """Gamepads and keyboards by evdev: axes, the dead-man's switch, what is pressed, and what is chosen."""
 
-from __future__ import annotations
-
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -59,7 +56,7 @@ def keyboard(path: str = "/dev/input/event5") -> Fake:
     return Fake(path, range(1, 120))
 
 
-def test_a_gamepad_moves_its_axes_and_is_enabled_by_a_shoulder_button() -> None:
+def test_a_gamepad_moves_its_axes_and_is_enabled_by_a_shoulder_button():
     device = pad()
     source = Gamepad(device)
     assert source.axes[:4] == (
@@ -82,7 +79,7 @@ def test_a_gamepad_moves_its_axes_and_is_enabled_by_a_shoulder_button() -> None:
     assert not source.read_input(0.04).enabled
 
 
-def test_what_is_pressed_counts_once_and_not_when_it_was_down_before() -> None:
+def test_what_is_pressed_counts_once_and_not_when_it_was_down_before():
     device = pad()
     device.down = {SOUTH}
     source = Gamepad(device)
@@ -94,14 +91,14 @@ def test_what_is_pressed_counts_once_and_not_when_it_was_down_before() -> None:
 
 
 @pytest.mark.parametrize("middle", [True, False])
-def test_the_right_stick_of_some_is_where_others_have_triggers(middle: bool) -> None:
+def test_the_right_stick_of_some_is_where_others_have_triggers(middle):
     at = 128 if middle else 0
     axes = dict.fromkeys((0, 1), (128, 0, 255)) | dict.fromkeys((2, 5), (at, 0, 255))
     assert len(Gamepad(pad(axes=axes)).axes) == (4 if middle else 2)
 
 
 @pytest.mark.parametrize("error", [OSError(19, "No such device"), SystemError("returned NULL")])
-def test_a_gamepad_that_is_unplugged_is_gone(error: BaseException) -> None:
+def test_a_gamepad_that_is_unplugged_is_gone(error):
     device = pad()
     source = Gamepad(device)
     device.gone = error
@@ -111,7 +108,7 @@ def test_a_gamepad_that_is_unplugged_is_gone(error: BaseException) -> None:
     assert device.closed
 
 
-def test_a_keyboard_of_its_own_is_taken_when_its_keys_are_up_and_reports_releases() -> None:
+def test_a_keyboard_of_its_own_is_taken_when_its_keys_are_up_and_reports_releases():
     device = keyboard()
     device.down = {28, Q}  # Enter, which began the command
     source = KeyboardDevice(device)
@@ -128,17 +125,14 @@ def test_a_keyboard_of_its_own_is_taken_when_its_keys_are_up_and_reports_release
     assert source.read_input(0.08) == ((0.0,) * 8, False, frozenset({Press.QUIT}))
 
 
-def test_a_mouse_is_neither() -> None:
+def test_a_mouse_is_neither():
     assert source_of(Fake(keys={0x110, 0x111})) is None
     assert source_of(Fake(keys={LEFT_SHOULDER})) is None  # no stick
     assert source_of(Fake(axes=XBOX)) is None  # no dead-man's switch
 
 
-# Which device
-
-
 @pytest.fixture
-def plugged_in(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[Fake]]:
+def plugged_in(monkeypatch):
     """Let these be the input devices; None is one that this user may not open."""
 
     def plug(*found: Fake | None) -> list[Fake]:
@@ -156,13 +150,13 @@ def plugged_in(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[Fake]]:
     return plug
 
 
-def test_the_only_gamepad_is_chosen_and_all_others_are_closed(plugged_in: Callable[..., list[Fake]]) -> None:
+def test_the_only_gamepad_is_chosen_and_all_others_are_closed(plugged_in):
     mouse, board, device = plugged_in(Fake("/dev/input/event1"), keyboard(), pad(), None)
     assert type(chosen(None)) is Gamepad
     assert (mouse.closed, board.closed, device.closed) == (True, True, False)
 
 
-def test_a_device_is_chosen_by_its_path(plugged_in: Callable[..., list[Fake]]) -> None:
+def test_a_device_is_chosen_by_its_path(plugged_in):
     found = plugged_in(pad("/dev/input/event2"), pad("/dev/input/event3"), keyboard())
     assert type(chosen("/dev/input/event5")) is KeyboardDevice
     assert [one.closed for one in found] == [True, True, False]
@@ -174,16 +168,10 @@ def test_a_device_is_chosen_by_its_path(plugged_in: Callable[..., list[Fake]]) -
         (None, 0, "no readable gamepad found; gamepads and keyboards: none"),
         (None, 2, "several gamepads found; choose one with --device; gamepads and keyboards:\n  /dev/in"),
         ("/dev/input/event1", 1, "/dev/input/event1 is not a readable gamepad or keyboard; gamepads"),
-        (
-            "pad",
-            1,
-            "pad is not a readable gamepad or keyboard; gamepads and keyboards:\n  /dev/input/e",
-        ),
+        ("pad", 1, "pad is not a readable gamepad or keyboard; gamepads and keyboards:\n  /dev/input/e"),
     ],
 )
-def test_what_cannot_be_chosen_is_refused_with_what_there_is(
-    plugged_in: Callable[..., list[Fake]], path: str | None, pads: int, said: str
-) -> None:
+def test_what_cannot_be_chosen_is_refused_with_what_there_is(plugged_in, path, pads, said):
     found = plugged_in(Fake("/dev/input/event1"), *(pad(f"/dev/input/event{at + 2}") for at in range(pads)))
     with pytest.raises(InputError) as refused:
         chosen(path)
@@ -191,13 +179,13 @@ def test_what_cannot_be_chosen_is_refused_with_what_there_is(
     assert all(one.closed for one in found)
 
 
-def test_a_user_who_may_not_open_them_is_given_the_way(plugged_in: Callable[..., list[Fake]]) -> None:
+def test_a_user_who_may_not_open_them_is_given_the_way(plugged_in):
     plugged_in(None)
     with pytest.raises(InputError, match=r"allow more with `sudo usermod -aG input \$USER` and a new log-in"):
         chosen(None)
 
 
-def test_without_evdev_the_pip_line_is_given(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_evdev_the_pip_line_is_given(monkeypatch):
     monkeypatch.setitem(sys.modules, "evdev", None)
     with pytest.raises(
         InputError, match=r"needs evdev \(not installed\); install it: `pip install 'dxlrun\[teleop\]'`"
@@ -205,7 +193,7 @@ def test_without_evdev_the_pip_line_is_given(monkeypatch: pytest.MonkeyPatch) ->
         chosen(None)
 
 
-def test_a_real_gamepad_of_the_kernel_is_read_and_gone() -> None:
+def test_a_real_gamepad_of_the_kernel_is_read_and_gone():
     evdev = pytest.importorskip("evdev", reason="the extra teleop is not installed")
     if not Path("/dev/uinput").exists():
         pytest.skip("no /dev/uinput: this kernel makes no virtual input devices")

@@ -1,7 +1,5 @@
 """Driving on virtual time: what moves, and that the robot holds, judged by the ledger of its servos."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from itertools import pairwise
@@ -105,7 +103,7 @@ CASES = {
 
 @pytest.mark.parametrize("ending", ["released", "unplugged", "killed"])
 @pytest.mark.parametrize("case", CASES)
-def test_the_robot_holds_within_250_ms(tmp_path: Path, case: str, ending: str) -> None:
+def test_the_robot_holds_within_250_ms(tmp_path, case, ending):
     name, item, targets, arguments, axes = CASES[case]
     robot = arm(tmp_path) if name == "arm" else ROBOTS / name
     run = driven(robot, ending, *targets, arguments=arguments, axes=axes)
@@ -124,7 +122,7 @@ def test_the_robot_holds_within_250_ms(tmp_path: Path, case: str, ending: str) -
             assert len(moved) > 10
 
 
-def test_tip_in_space_keeps_its_limits_and_those_of_the_joints() -> None:
+def test_tip_in_space_keeps_its_limits_and_those_of_the_joints():
     """Judged by the goals of the servos, with forward kinematics of the tests' own."""
     arm = arms()["open_manipulator_x"]
     run = driven(
@@ -148,7 +146,7 @@ def test_tip_in_space_keeps_its_limits_and_those_of_the_joints() -> None:
     assert tip_speeds[times[1:] > END_S + 0.15 + 0.4 + 0.1].max() == 0.0  # lease, and 0.2 m/s at 0.5 m/s^2
 
 
-def test_client_that_stood_still_moves_on_from_where_the_joint_is(tmp_path: Path) -> None:
+def test_client_that_stood_still_moves_on_from_where_the_joint_is(tmp_path):
     """It does not make up for the time in which it did not run."""
     run = DrivenRobot(arm(tmp_path), 2.5, {})
 

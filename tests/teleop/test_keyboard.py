@@ -1,12 +1,9 @@
 """The keyboard behind a terminal: keys that are held, for how long, and the terminal as it was before."""
 
-from __future__ import annotations
-
 import io
 import os
 import sys
 import termios
-from collections.abc import Iterator
 from contextlib import closing
 from types import SimpleNamespace
 from typing import NamedTuple
@@ -34,7 +31,7 @@ class Terminal(NamedTuple):
 
 
 @pytest.fixture
-def terminal(monkeypatch: pytest.MonkeyPatch) -> Iterator[Terminal]:
+def terminal(monkeypatch):
     master, slave = os.openpty()
     yield Terminal(master, slave, monkeypatch)
     os.close(slave)
@@ -46,7 +43,7 @@ def axes(**sides: float) -> tuple[float, ...]:
     return tuple(sides.get(f"a{axis}", 0.0) for axis in range(8))
 
 
-def test_a_key_counts_as_held_until_it_was_not_repeated_for_a_while(terminal: Terminal) -> None:
+def test_a_key_counts_as_held_until_it_was_not_repeated_for_a_while(terminal):
     with closing(terminal.keyboard()) as keyboard:
         assert keyboard.read_input(9.0) == (axes(), False, frozenset())
         terminal.types("q")
@@ -72,13 +69,13 @@ def test_a_key_counts_as_held_until_it_was_not_repeated_for_a_while(terminal: Te
         ("q ", {}),
     ],
 )
-def test_keys_and_arrows_move_axes(terminal: Terminal, typed: str, sides: dict[str, float]) -> None:
+def test_keys_and_arrows_move_axes(terminal, typed, sides):
     with closing(terminal.keyboard()) as keyboard:
         terminal.types(typed)
         assert keyboard.read_input(0.0) == (axes(**sides), bool(sides), frozenset())
 
 
-def test_an_arrow_that_comes_in_parts_is_no_letter(terminal: Terminal) -> None:
+def test_an_arrow_that_comes_in_parts_is_no_letter(terminal):
     with closing(terminal.keyboard()) as keyboard:
         for part in ("\x1b", "[", "1;"):
             terminal.types(part)
@@ -87,7 +84,7 @@ def test_an_arrow_that_comes_in_parts_is_no_letter(terminal: Terminal) -> None:
         assert keyboard.read_input(0.0).axes == axes(a0=1.0)
 
 
-def test_what_is_pressed_and_the_end_of_the_terminal(terminal: Terminal) -> None:
+def test_what_is_pressed_and_the_end_of_the_terminal(terminal):
     with closing(terminal.keyboard()) as keyboard:
         terminal.types("\t+-\x1b")
         assert keyboard.read_input(0.0).presses == {Press.NEXT, Press.FASTER, Press.SLOWER}
@@ -95,7 +92,7 @@ def test_what_is_pressed_and_the_end_of_the_terminal(terminal: Terminal) -> None
         assert keyboard.read_input(0.0).presses == {Press.QUIT}
 
 
-def test_the_terminal_is_as_it_was(terminal: Terminal) -> None:
+def test_the_terminal_is_as_it_was(terminal):
     before = termios.tcgetattr(terminal.slave)
     keyboard = terminal.keyboard()
     assert not termios.tcgetattr(terminal.slave)[3] & (termios.ECHO | termios.ICANON)
@@ -104,7 +101,7 @@ def test_the_terminal_is_as_it_was(terminal: Terminal) -> None:
     assert termios.tcgetattr(terminal.slave) == before
 
 
-def test_without_a_terminal_a_device_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_terminal_a_device_is_asked_for(monkeypatch):
     monkeypatch.setattr(sys, "stdin", io.StringIO())
     with pytest.raises(InputError, match=r"needs a terminal or an input device; .*--gamepad"):
         TerminalKeyboard()

@@ -1,12 +1,8 @@
 """The commands of docs/how-to/teleoperation.md, and its robot with an arm at each of two ports."""
 
-from __future__ import annotations
-
 import re
 import shlex
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 from tests.kit.driven import changes
@@ -24,9 +20,7 @@ TICKS = 4096 / 360
 
 
 @pytest.mark.parametrize("line", COMMANDS)
-def test_its_commands_do_what_they_say(
-    dxlrun: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, line: str
-) -> None:
+def test_its_commands_do_what_they_say(dxlrun, tmp_path, monkeypatch, line):
     """What `dxlrun teleop` does then: tests/teleop/test_terminal.py."""
     (tmp_path / "robots").symlink_to(ROOT / "robots")
     monkeypatch.chdir(tmp_path)
@@ -40,7 +34,7 @@ def test_its_commands_do_what_they_say(
         assert dxlrun(*words, "--virtual", "--duration", "0.1", "--no-record").code == 0
 
 
-def test_an_arm_at_one_port_follows_the_hand_at_the_other() -> None:
+def test_an_arm_at_one_port_follows_the_hand_at_the_other():
     robot = simulated_robot(TWO_PORTS, duration_s=4.0)
     leader, _ = robot.buses
     hand_s = 1.0

@@ -1,7 +1,5 @@
 """The dead-man's switch and the banks on virtual time: what is released first, what ends in order."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -70,38 +68,38 @@ def moves(run: DrivenRobot) -> dict[int, list[tuple[float, int]]]:
     return {servo: goals[1:] for servo, goals in found.items() if goals[1:]}
 
 
-def test_what_is_held_from_the_start_moves_nothing_before_it_was_released(tmp_path: Path) -> None:
+def test_what_is_held_from_the_start_moves_nothing_before_it_was_released(tmp_path):
     found = moves(driven(tmp_path, (0.0, HELD), (0.8, FREE), (1.0, HELD), (1.5, FREE)))
     assert {*found} == {1}
     assert min(at for at, _ in found[1]) > 1.0
 
 
-def test_another_bank_holds_and_moves_only_when_the_switch_was_released(tmp_path: Path) -> None:
+def test_another_bank_holds_and_moves_only_when_the_switch_was_released(tmp_path):
     found = moves(driven(tmp_path, (0.5, HELD), (1.0, NEXT), (1.5, FREE), (1.6, HELD), (2.0, FREE)))
     assert max(at for at, _ in found[1]) < 1.25
     assert min(at for at, _ in found[2]) > 1.6
 
 
-def test_a_release_ends_the_stream_in_order(tmp_path: Path) -> None:
+def test_a_release_ends_the_stream_in_order(tmp_path):
     run = driven(tmp_path, (0.5, HELD), (1.0, FREE))
     assert moves(run)
     assert run.virtual.result is not None
     assert run.virtual.result.reason == "ended"
 
 
-def test_a_joint_stops_at_its_limit(tmp_path: Path) -> None:
+def test_a_joint_stops_at_its_limit(tmp_path):
     found = moves(driven(tmp_path, (0.5, HELD), (2.0, FREE), targets=("wrist",), factor=4.0))
     assert {*found} == {2}
     assert found[2][-1][1] == pytest.approx(2048 + 30 * TICKS, abs=1)
 
 
-def test_a_joint_that_is_as_fast_as_it_may_be_stops_when_it_is_released(tmp_path: Path) -> None:
+def test_a_joint_that_is_as_fast_as_it_may_be_stops_when_it_is_released(tmp_path):
     slow = ROBOT.replace("limits: {", "limits: {velocity: 0.4 rad/s, ")
     found = moves(driven(tmp_path, (0.5, HELD), (1.0, FREE), (1.6, FREE), factor=4.0, text=slow))
     assert 0.9 < max(at for at, _ in found[1]) < 1.25
 
 
-def test_a_joint_that_is_as_fast_as_it_may_be_turns_back_at_once(tmp_path: Path) -> None:
+def test_a_joint_that_is_as_fast_as_it_may_be_turns_back_at_once(tmp_path):
     slow = ROBOT.replace("limits: {", "limits: {velocity: 0.4 rad/s, ")
     script = (0.5, HELD), (1.0, BACK), (1.5, FREE)
     goals = moves(driven(tmp_path, *script, factor=4.0, text=slow))[1]
@@ -109,9 +107,7 @@ def test_a_joint_that_is_as_fast_as_it_may_be_turns_back_at_once(tmp_path: Path)
     assert 0.9 < turned_s < 1.15
 
 
-def test_targets_choose_joints_in_their_order_and_what_no_controller_takes_is_refused(
-    tmp_path: Path,
-) -> None:
+def test_targets_choose_joints_in_their_order_and_what_no_controller_takes_is_refused(tmp_path):
     path = tmp_path / "arm.yaml"
     path.write_text(ROBOT)
     run = DrivenRobot(path, 0.1, {})

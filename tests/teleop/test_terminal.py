@@ -1,14 +1,9 @@
-"""`dxlrun teleop` at a terminal: keys move a base; by Ctrl-C and a kill it holds.
-
-The base and `dxlrun teleop` are the first two commands of docs/how-to/teleoperation.md.
-"""
-
-from __future__ import annotations
+"""`dxlrun teleop` at a terminal: keys move the base of teleoperation.md; by Ctrl-C and a kill it holds."""
 
 import re
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 
@@ -28,7 +23,7 @@ GOAL_VELOCITY = 104
 
 
 @pytest.fixture
-def ledger(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+def ledger(tmp_path, monkeypatch):
     """The ledger of a base that runs."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     words = [sys.executable, "-P", "-c", CODE, str(ROBOT), "--no-record", "--ledger", "seen.jsonl"]
@@ -60,9 +55,7 @@ def drives(screen: Screen, key: str, done: Callable[[], bool]) -> None:
     until(typed)
 
 
-def test_a_base_is_driven_and_holds_when_the_program_is_interrupted_and_when_it_is_killed(
-    ledger: Path, tmp_path: Path
-) -> None:
+def test_a_base_is_driven_and_holds_when_the_program_is_interrupted_and_when_it_is_killed(ledger, tmp_path):
     with Screen(tmp_path, "teleop") as screen:
         screen.sees("diff_drive: base holds")
         drives(screen, "q", lambda: min(speeds()) > 0.5)

@@ -1,20 +1,15 @@
 """A log, a running robot, and pages that are served."""
 
-from __future__ import annotations
-
 import ssl
-import subprocess
-import sys
-from collections.abc import Callable, Iterator
 from importlib.resources import files
 from pathlib import Path
 
 import pytest
-from tests.kit.awaited import DEADLINE_S
 from tests.kit.browser import CHROMIUM, Browser
 from tests.kit.torso import Run
 from tests.view.served import Served
 
+from dxlrun.testing import simulated_robot
 from dxlrun_view.live_robot import LiveRobot
 from dxlrun_view.recorded_robot import RecordedRobot
 from dxlrun_view.shown import ViewSource
@@ -23,32 +18,21 @@ ROBOTS = Path(__file__).resolve().parents[2] / "robots"
 
 
 @pytest.fixture(scope="session")
-def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def log(tmp_path_factory):
     """The log of 12 s of the torso with an IMU, whose arms and head move."""
-    place = tmp_path_factory.mktemp("run")
-    words = [ROBOTS / "bioloid_torso_imu.yaml", "--play", ROBOTS / "motions/three_parts.yaml"]
-    command = [
-        sys.executable,
-        "-c",
-        "from dxlrun.cli import main; main()",
-        *map(str, words),
-        "--virtual",
-        "--duration",
-        "12",
-    ]
-    done = subprocess.run(command, cwd=place, capture_output=True, text=True, timeout=DEADLINE_S, check=False)
-    assert done.returncode == 0, done.stderr
-    (found,) = (place / "logs").glob("*.mcap")
-    return found
+    path = tmp_path_factory.mktemp("run") / "run.mcap"
+    play = [ROBOTS / "motions/three_parts.yaml"]
+    simulated_robot(ROBOTS / "bioloid_torso_imu.yaml", play=play, duration_s=12, log=path).run()
+    return path
 
 
 @pytest.fixture(scope="session")
-def recorded(log: Path) -> RecordedRobot:
+def recorded(log):
     return RecordedRobot(log)
 
 
 @pytest.fixture(scope="package")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
+def run(tmp_path_factory):
     one = Run(tmp_path_factory.mktemp("live"))
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_RUNTIME_DIR", str(one.place))
@@ -58,14 +42,14 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
 
 
 @pytest.fixture
-def live(run: Run) -> Iterator[LiveRobot]:
+def live(run):
     robot = LiveRobot("bioloid_torso_imu")
     yield robot
     robot.close()
 
 
 @pytest.fixture(scope="package")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+def browser(tmp_path_factory):
     if CHROMIUM is None:
         pytest.skip("no Chromium is installed; apt install chromium")
     if not files("dxlrun_view").joinpath("page", "build", "page.js").is_file():
@@ -77,7 +61,7 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 
 
 @pytest.fixture
-def serve() -> Iterator[Callable[..., Served]]:
+def serve():
     served: list[Served] = []
 
     def make(source: ViewSource, *, control: bool = False, tls: ssl.SSLContext | None = None) -> Served:

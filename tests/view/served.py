@@ -1,7 +1,5 @@
 """A page that is served, and what a browser would ask of it."""
 
-from __future__ import annotations
-
 import http.client
 import json
 import ssl

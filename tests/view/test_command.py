@@ -1,7 +1,5 @@
 """`dxlrun view`: what it prints, what it refuses, how it ends; runs the commands of docs/how-to/view.md."""
 
-from __future__ import annotations
-
 import http.client
 import os
 import re
@@ -16,7 +14,7 @@ from pathlib import Path
 
 import pytest
 from tests.kit.awaited import DEADLINE_S
-from tests.kit.commands import Dxlrun
+from tests.kit.commands import cases, play
 from tests.kit.pages import page_commands
 
 from dxlrun.cli import verb_registry
@@ -27,11 +25,10 @@ pytestmark = pytest.mark.long
 ROOT = Path(__file__).resolve().parents[2]
 LOGS = [words for words in page_commands("view.md") if words[-1].endswith(".mcap")]
 ROBOTS = [words for words in page_commands("view.md") if words[0] == "view" and words not in LOGS]
-KEYS = "make it by `dxlrun keys robot bioloid_torso_imu`"
 
 
 @pytest.fixture(autouse=True)
-def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def place(tmp_path, monkeypatch):
     """A directory with a log, where no robot runs and the package counts as installed."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
@@ -42,9 +39,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "[::1]"])
-def test_log_is_served_until_ctrl_c(
-    log: Path, place: Path, monkeypatch: pytest.MonkeyPatch, host: str
-) -> None:
+def test_log_is_served_until_ctrl_c(log, place, monkeypatch, host):
     (place / "logs").mkdir()
     shutil.copy(log, place / "logs/bioloid_torso.mcap")
     # as if installed, which would fetch what its page is made of
@@ -74,31 +69,19 @@ def test_log_is_served_until_ctrl_c(
         assert process.wait(DEADLINE_S) == 0
 
 
-@pytest.mark.parametrize(
-    ("words", "code", "part"),
-    [
-        *((words[1:], 1, "dxlrun ROBOT.yaml") for words in ROBOTS),
-        (["nothing"], 2, "nothing"),
-        (["gone.mcap"], 2, "gone.mcap"),
-        (["gone.yaml"], 2, "gone.yaml"),
-        ([str(ROOT / "robots/bioloid_torso.yaml")], 1, "start it in another terminal"),
-        (["bad.mcap"], 2, "bad.mcap"),
-        (["--listen", ":99999999"], 2, "HOST:PORT"),
-        (["{log}", "--listen", "127.0.0.99999"], 2, KEYS),
-        (["{log}", "--listen", "192.0.2.1"], 2, KEYS),
-        (["{log}", "--listen", "::"], 2, KEYS),
-    ],
-)
-def test_what_cannot_be_shown_is_refused(
-    dxlrun: Dxlrun, log: Path, words: list[str], code: int, part: str
-) -> None:
-    Path("bad.mcap").write_bytes(b"nothing")
-    said = dxlrun("view", *(word.format(log=log) for word in words), "--no-browser")
-    assert (said.code, part in said.err) == (code, True), said
-    assert "Traceback" not in said.err
+@pytest.mark.parametrize("case", cases(Path(__file__).with_name("refusals.txt")))
+def test_refused(dxlrun, log, place, case):
+    (place / "log.mcap").symlink_to(log)
+    play(case, dxlrun)
 
 
-def test_port_that_is_taken_is_named(dxlrun: Dxlrun, log: Path) -> None:
+@pytest.mark.parametrize("words", ROBOTS)
+def test_a_robot_that_does_not_run_is_refused(dxlrun, words):
+    said = dxlrun(*words, "--no-browser")
+    assert (said.code, "dxlrun ROBOT.yaml" in said.err) == (1, True), said
+
+
+def test_port_that_is_taken_is_named(dxlrun, log):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = str(taken.getsockname()[1])
         said = dxlrun("view", log, "--no-browser", "--listen", f":{port}")

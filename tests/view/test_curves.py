@@ -1,7 +1,5 @@
 """Curves: what is kept of a running robot, and what a plot gets."""
 
-from __future__ import annotations
-
 import math
 
 import msgspec
@@ -16,7 +14,7 @@ from dxlrun_view.curves import History, numbers_in, thinned
 from dxlrun_view.live_robot import LiveRobot
 
 
-def test_memory_holds_the_newest_moments_and_no_more() -> None:
+def test_memory_holds_the_newest_moments_and_no_more():
     history = History(("a", "b"), 10)
     assert history.at().values == []
     for number in range(25):
@@ -34,7 +32,7 @@ def test_memory_holds_the_newest_moments_and_no_more() -> None:
 
 
 @pytest.mark.parametrize("count", [1, 9, 10, 11, 20, 37])
-def test_times_are_found_wherever_the_memory_begins(count: int) -> None:
+def test_times_are_found_wherever_the_memory_begins(count):
     history = History(("a",), 10)
     for number in range(count):
         history.append(number / 2, np.array([number]))
@@ -42,7 +40,7 @@ def test_times_are_found_wherever_the_memory_begins(count: int) -> None:
         assert history.at(number / 2 + 0.1).values == [number]
 
 
-def test_no_peak_is_lost_by_thinning() -> None:
+def test_no_peak_is_lost_by_thinning():
     values = np.zeros(100_000)
     values[54_321], values[777] = 9.0, -7.0
     curve = thinned("a", np.arange(100_000) / 1e3, values, 300)
@@ -53,7 +51,7 @@ def test_no_peak_is_lost_by_thinning() -> None:
     assert set(unknown.value) == {None}
 
 
-def test_numbers_of_a_message_are_named() -> None:
+def test_numbers_of_a_message_are_named():
     message = {"error": np.array([0.1, 0.2]), "name": "arm", "pose": {"x": 1}, "on": True, "names": ["a"]}
     found = numbers_in(message, "/arm/state:")
     assert found == {

@@ -1,16 +1,12 @@
 """A tip that is dragged on the page: planned and shown, and moved once it is sent; judged by the ledger."""
 
-from __future__ import annotations
-
 import json
 import math
-from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
 import pytest
 from tests.kit.awaited import until
-from tests.kit.browser import Browser
 from tests.kit.driven import changes
 from tests.kit.judged_arms import example
 from tests.kit.torso import ROBOTS, Run
@@ -27,7 +23,7 @@ TICK = math.tau / 4096
 
 
 @pytest.fixture(scope="module")
-def arm(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
+def arm(tmp_path_factory):
     one = Run(tmp_path_factory.mktemp("arm"), robot=NAME, rate=10)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_RUNTIME_DIR", str(one.place))
@@ -37,7 +33,7 @@ def arm(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
 
 
 @pytest.fixture
-def page(arm: Run) -> Iterator[Callable[..., Served]]:
+def page(arm):
     robot = LiveRobot(NAME)
     served: list[Served] = []
 
@@ -67,7 +63,7 @@ def acted(served: Served, verb: str, position: Any, **more: object) -> tuple[int
     return status, json.loads(answer)
 
 
-def test_a_pose_is_planned_without_a_motion_and_then_sent(arm: Run, page: Callable[..., Served]) -> None:
+def test_a_pose_is_planned_without_a_motion_and_then_sent(arm, page):
     served = page(control=True)
     until(lambda: served.look(shown=True)["shown"]["columns"])
     handle = {"controller": "arm", "tip": "end_effector_link", "base": ""}
@@ -89,7 +85,7 @@ def test_a_pose_is_planned_without_a_motion_and_then_sent(arm: Run, page: Callab
     assert [acted(page(control=False), verb, goal)[0] for verb in ("plan", "pose")] == [403, 403]
 
 
-def test_a_handle_is_dragged_and_sent(arm: Run, page: Callable[..., Served], browser: Browser) -> None:
+def test_a_handle_is_dragged_and_sent(arm, page, browser):
     browser.open(page(control=True).address)
     browser.until("document.querySelector('#handle')?.options.length === 2")
     begin = tip(arm)

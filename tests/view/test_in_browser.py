@@ -1,24 +1,17 @@
 """The page in Chromium: what clicks do, to the servos too; the robot moves, curves advance, a log plays."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 from tests.kit.awaited import until
 from tests.kit.browser import Browser
-from tests.kit.torso import GOAL_POSITION, JOINT, SERVO, TORQUE_ENABLE, Run
-from tests.view.served import Served
+from tests.kit.torso import GOAL_POSITION, JOINT, SERVO, TORQUE_ENABLE
 
 from dxlrun.tooling.live import JointServo
 from dxlrun_view.curves import Curve, Moment
-from dxlrun_view.live_robot import LiveRobot
 from dxlrun_view.recorded_robot import RecordedRobot
 from dxlrun_view.shown import LiveEvent, SourceProperties, ViewedController, ViewedRobot
 
-Serve = Callable[..., Served]
 VISIBLE = "(selector => document.querySelector(selector).offsetParent !== null)"
 """In the page: whether an element is visible."""
 ENABLED = """[...document.querySelectorAll('fieldset :is(input, button, select)')]
@@ -34,7 +27,7 @@ def errors(browser: Browser) -> list[object]:
     return [one for one in found if "ERR_CONNECTION_REFUSED" not in str(one)]
 
 
-def test_a_log_plays_and_jumps(recorded: RecordedRobot, serve: Serve, browser: Browser) -> None:
+def test_a_log_plays_and_jumps(recorded, serve, browser):
     browser.open(serve(recorded).address)
     browser.until("window.looked > 3 && !!document.querySelector('.legend b')?.textContent")
     assert browser.value("document.querySelector('#robot').textContent") == "bioloid_torso_imu"
@@ -63,9 +56,7 @@ def looks(browser: Browser, more: int) -> None:
     browser.until(f"window.looked > {browser.value('window.looked') + more}")
 
 
-def test_switch_slider_and_stop_reach_the_servos(
-    live: LiveRobot, run: Run, serve: Serve, browser: Browser
-) -> None:
+def test_switch_slider_and_stop_reach_the_servos(live, run, serve, browser):
     browser.open(serve(live, control=True).address)
     browser.until("document.querySelector('.legend b')?.textContent")
     browser.click("[data-tab=controllers]")
@@ -161,7 +152,7 @@ def await_phase(browser: Browser, phase: str) -> None:
     browser.until(f"document.body?.dataset.phase === '{phase}' && window.looked > 1")
 
 
-def test_controls_are_enabled_only_with_fresh_states(serve: Serve, browser: Browser) -> None:
+def test_controls_are_enabled_only_with_fresh_states(serve, browser):
     robot = Scripted()
     browser.open(serve(robot, control=True).address)
     await_phase(browser, "loading")
@@ -196,7 +187,7 @@ def test_controls_are_enabled_only_with_fresh_states(serve: Serve, browser: Brow
     assert [one for one in errors(browser) if "409 (Conflict)" not in str(one)] == []
 
 
-def test_header_shows_voltage_hottest_servo_and_errors_first(serve: Serve, browser: Browser) -> None:
+def test_header_shows_voltage_hottest_servo_and_errors_first(serve, browser):
     robot = Scripted()
     robot.begin(voltage=(11.9, 11.2), temperature=(41, 67), hardware_error=(0, 0), torque=(1, 1))
     browser.open(serve(robot, control=True).address, 390, 844)
@@ -224,7 +215,7 @@ def test_header_shows_voltage_hottest_servo_and_errors_first(serve: Serve, brows
     assert errors(browser) == []
 
 
-def test_hot_servo_is_marked_near_its_own_temperature_limit(serve: Serve, browser: Browser) -> None:
+def test_hot_servo_is_marked_near_its_own_temperature_limit(serve, browser):
     robot = Scripted()
     browser.open(serve(robot).address)
     hot = "[...document.querySelectorAll('#joints .hot')].length"
@@ -234,7 +225,7 @@ def test_hot_servo_is_marked_near_its_own_temperature_limit(serve: Serve, browse
         browser.until(f"{hot} === {number} && {figure} === '{'bad' * number}'")
 
 
-def test_page_of_a_log_waits_for_no_robot(recorded: RecordedRobot, serve: Serve, browser: Browser) -> None:
+def test_page_of_a_log_waits_for_no_robot(recorded, serve, browser):
     browser.open(serve(recorded).address.partition("?")[0])  # without the token, it gets no data
     browser.until("document.querySelector('#banner')?.textContent.includes('token')")
     assert browser.value("document.querySelector('#phase').textContent") == "Reading"
@@ -246,9 +237,7 @@ def test_page_of_a_log_waits_for_no_robot(recorded: RecordedRobot, serve: Serve,
 
 
 @pytest.mark.parametrize("window", [(1440, 900, False), (1024, 700, False), (390, 844, True)])
-def test_all_of_the_page_fits_the_window(
-    recorded: RecordedRobot, serve: Serve, browser: Browser, window: tuple[int, int, bool]
-) -> None:
+def test_all_of_the_page_fits_the_window(recorded, serve, browser, window):
     width, height, dark = window
     browser.open(serve(recorded).address, width, height, dark=dark)
     browser.until("window.looked > 3")
@@ -262,7 +251,7 @@ def test_all_of_the_page_fits_the_window(
     assert errors(browser) == []
 
 
-def test_a_page_whose_server_ended_says_so(log: Path, serve: Serve, browser: Browser) -> None:
+def test_a_page_whose_server_ended_says_so(log, serve, browser):
     served = serve(RecordedRobot(log))
     browser.open(served.address)
     browser.until("window.looked > 3")

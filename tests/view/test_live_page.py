@@ -1,12 +1,8 @@
 """The server of a running robot's page: it follows, steers where it may, and stops; judged by the ledger."""
 
-from __future__ import annotations
-
 import json
 import os
-import random
 import socket
-from collections.abc import Callable
 from functools import partial
 from typing import Any, cast
 
@@ -14,7 +10,7 @@ import pytest
 from tests.kit.awaited import until
 from tests.kit.campaigns import campaign
 from tests.kit.fuzzed_http import Said, check_port_survives_fuzzing
-from tests.kit.torso import GOAL_POSITION, JOINT, SERVO, TORQUE_ENABLE, Run, settled, written
+from tests.kit.torso import GOAL_POSITION, JOINT, SERVO, TORQUE_ENABLE, settled, written
 from tests.view.served import Served
 
 from dxlrun import Refused, RemoteRobot
@@ -23,7 +19,6 @@ from dxlrun_view.live_robot import LiveRobot, offered_motions
 from dxlrun_view.page_server import HEADER
 from dxlrun_view.shown import ViewedController, ViewedRobot
 
-Serve = Callable[..., Served]
 ACTIONS: tuple[dict[str, object], ...] = (
     {"verb": "halt"},
     {"verb": "pause"},
@@ -79,13 +74,13 @@ def column(served: Served, name: str) -> Any:
     return values[seen["shown"]["columns"].index(name)] if values else None
 
 
-def test_it_offers_motions_of_controllers() -> None:
+def test_it_offers_motions_of_controllers():
     pages = ViewedController("pages", "keyframe_player", True, motions={"march": None, "bow": 1.0})
     robot = ViewedRobot("two", controllers=(pages,), file="/nowhere/two.yaml")
     assert [*offered_motions(robot)] == ["pages/march", "pages/bow"]
 
 
-def test_it_follows_the_robot(live: LiveRobot, serve: Serve) -> None:
+def test_it_follows_the_robot(live, serve):
     served = serve(live)
     first = until(lambda: column(served, "loop/cycle"))
     assert until(lambda: (column(served, "loop/cycle") or 0) > first + 5)
@@ -110,7 +105,7 @@ def test_it_follows_the_robot(live: LiveRobot, serve: Serve) -> None:
     assert until(lambda: served.look(spans=[span])["curves"][0][0]["value"])
 
 
-def test_a_page_that_may_not_steer_only_stops(live: LiveRobot, serve: Serve, run: Run) -> None:
+def test_a_page_that_may_not_steer_only_stops(live, serve, run):
     with live.asking() as robot:
         robot.torque("all", on=True)
     until(lambda: run.written(TORQUE_ENABLE)[SERVO] == 1)
@@ -124,7 +119,7 @@ def test_a_page_that_may_not_steer_only_stops(live: LiveRobot, serve: Serve, run
     until(lambda: run.limp)
 
 
-def test_a_wrong_message_is_refused_with_a_sentence(live: LiveRobot, serve: Serve) -> None:
+def test_a_wrong_message_is_refused_with_a_sentence(live, serve):
     served = serve(live, control=True)
     for message in WRONG:
         status, answer = served.ask("/act", message if message is not None else "null")
@@ -144,9 +139,7 @@ def test_a_wrong_message_is_refused_with_a_sentence(live: LiveRobot, serve: Serv
 
 
 @campaign(ci=300, night=100_000, release=1_000_000)
-def test_fuzzed_clicks_without_the_token_or_from_elsewhere_move_nothing(
-    live: LiveRobot, serve: Serve, run: Run, amount: float, chance: random.Random
-) -> None:
+def test_fuzzed_clicks_without_the_token_or_from_elsewhere_move_nothing(live, serve, run, amount, chance):
     served = serve(live, control=True)
     with live.asking() as robot:
         before = settled(run.ledger, lambda: robot.info()["cycles"], 20)
@@ -169,7 +162,7 @@ def test_fuzzed_clicks_without_the_token_or_from_elsewhere_move_nothing(
     assert written(run.ledger) == before
 
 
-def test_sliders_and_buttons_reach_the_servos(live: LiveRobot, serve: Serve, run: Run) -> None:
+def test_sliders_and_buttons_reach_the_servos(live, serve, run):
     served = serve(live, control=True)
     assert served.ask("/act", {"verb": "torque", "joints": ["all"], "on": True})[0] == 200
     arms = ["left_arm", "right_arm", "head"]
@@ -201,7 +194,7 @@ def fresh(served: Served) -> Any:
     return None if row["active"] else shown
 
 
-def test_a_robot_that_ends_and_comes_back(live: LiveRobot, serve: Serve, run: Run) -> None:
+def test_a_robot_that_ends_and_comes_back(live, serve, run):
     served = serve(live)
     until(lambda: column(served, "loop/cycle"))
     before = until(lambda: served.look(after=0)["events"])
@@ -224,7 +217,7 @@ def test_a_robot_that_ends_and_comes_back(live: LiveRobot, serve: Serve, run: Ru
     assert after[-1]["time"] > before[-1]["time"]
 
 
-def test_a_robot_that_does_not_run_is_waited_for() -> None:
+def test_a_robot_that_does_not_run_is_waited_for():
     robot = LiveRobot("nowhere")
     shown = robot.describe_page()
     robot.close()
@@ -233,7 +226,7 @@ def test_a_robot_that_does_not_run_is_waited_for() -> None:
 
 
 @pytest.mark.parametrize("refused", [False, True])
-def test_stop_ends_the_run_where_torque_off_is_refused(refused: bool) -> None:
+def test_stop_ends_the_run_where_torque_off_is_refused(refused):
     asked: list[str] = []
 
     class Robot:

@@ -1,15 +1,10 @@
 """The page of a log: what it shows is what the log has; what is wrong is refused in a sentence."""
 
-from __future__ import annotations
-
 import socket
-from collections.abc import Callable
 from contextlib import ExitStack
-from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.view.served import Served
 
 import dxlrun_view.recorded_robot as module
 from dxlrun import open_log
@@ -18,11 +13,10 @@ from dxlrun.remote.network.listener import MOST_UNPROVED
 from dxlrun_view.page_server import mesh_file
 from dxlrun_view.recorded_robot import RecordedRobot
 
-Serve = Callable[..., Served]
 JOINT = "right_elbow_joint"
 
 
-def test_columns_are_those_of_the_cycles(log: Path, recorded: RecordedRobot, serve: Serve) -> None:
+def test_columns_are_those_of_the_cycles(log, recorded, serve):
     served = serve(recorded)
     seen = served.look(
         shown=True, spans=[{"names": [f"{JOINT}/position"], "begin": 0, "end": 99, "points": 4000}]
@@ -43,7 +37,7 @@ def test_columns_are_those_of_the_cycles(log: Path, recorded: RecordedRobot, ser
     assert served.ask("/urdf")[1].startswith(b"<?xml")
 
 
-def test_fields_of_topics_are_drawn(recorded: RecordedRobot, serve: Serve) -> None:
+def test_fields_of_topics_are_drawn(recorded, serve):
     served = serve(recorded)
     fields = served.look(shown=True)["shown"]["fields"]
     assert "/imu/imu:orientation.w" in fields
@@ -53,7 +47,7 @@ def test_fields_of_topics_are_drawn(recorded: RecordedRobot, serve: Serve) -> No
     assert [one["value"] for one in others] == [[], []]
 
 
-def test_a_long_log_is_thinned_and_keeps_its_worst_cycles(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_long_log_is_thinned_and_keeps_its_worst_cycles(log, monkeypatch):
     whole = RecordedRobot(log).describe_page()
     monkeypatch.setattr(module, "MOST_CYCLES", 100)
     monkeypatch.setattr(log_reader, "SLICE_BYTES", 1)
@@ -77,9 +71,7 @@ def test_a_long_log_is_thinned_and_keeps_its_worst_cycles(log: Path, monkeypatch
         ({}, 200),
     ],
 )
-def test_the_page_answers_itself_alone(
-    recorded: RecordedRobot, serve: Serve, headers: dict[str, str], status: int
-) -> None:
+def test_the_page_answers_itself_alone(recorded, serve, headers, status):
     served = serve(recorded, control=True)
     assert served.ask("/look", {}, **headers)[0] == status
     assert served.ask("/urdf", None, **headers)[0] == status
@@ -89,7 +81,7 @@ def test_the_page_answers_itself_alone(
     assert own[0] == 200
 
 
-def test_idle_connections_do_not_keep_the_browser_out(recorded: RecordedRobot, serve: Serve) -> None:
+def test_idle_connections_do_not_keep_the_browser_out(recorded, serve):
     served = serve(recorded)
     with ExitStack() as opened:
         for _ in range(3 * MOST_UNPROVED):
@@ -97,9 +89,7 @@ def test_idle_connections_do_not_keep_the_browser_out(recorded: RecordedRobot, s
         assert served.look()["moment"]
 
 
-def test_only_meshes_of_the_urdf_are_given_away(
-    recorded: RecordedRobot, serve: Serve, tmp_path: Path
-) -> None:
+def test_only_meshes_of_the_urdf_are_given_away(recorded, serve, tmp_path):
     served = serve(recorded)
     for name in ("/etc/passwd", "../../etc/passwd", "robot.yaml", "", "bioloid_torso.urdf"):
         assert served.ask(f"/mesh?name={name}")[0] == 404
@@ -113,9 +103,7 @@ def test_only_meshes_of_the_urdf_are_given_away(
     assert mesh_file(tmp_path, "package://other/meshes/b.stl") is None
 
 
-def test_mesh_that_the_urdf_does_not_name_is_not_served(
-    recorded: RecordedRobot, serve: Serve, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_mesh_that_the_urdf_does_not_name_is_not_served(recorded, serve, tmp_path, monkeypatch):
     """In the folder of the robot, and in those next to and above it."""
     folder = tmp_path / "robot"
     for path in (

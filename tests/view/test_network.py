@@ -1,29 +1,21 @@
 """The page beyond this computer: certificates of both ends, and what the role of a browser allows."""
 
-from __future__ import annotations
-
 import ssl
-from collections.abc import Callable
 from http.client import HTTPException
-from pathlib import Path
 
 import pytest
-from tests.view.served import Served
 
 from dxlrun import InputError
 from dxlrun.remote.network.certificates import client_context, keys_place, server_context
 from dxlrun.remote.requests.request_table import Role
 from dxlrun_view.page_server import HEADER
-from dxlrun_view.recorded_robot import RecordedRobot
 
 authority = pytest.importorskip("dxlrun_fleet.authority", reason="needs the extra network")
 ROBOT = "bioloid_torso_imu"
-Serve = Callable[..., Served]
-Browse = Callable[[str], ssl.SSLContext]
 
 
 @pytest.fixture
-def browse(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Browse:
+def browse(tmp_path, monkeypatch):
     """Makes what a browser with a certificate of a role shows; the robot's is in the settings."""
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
     authority.issue(ROBOT, None, 30, keys_place())
@@ -40,9 +32,7 @@ def browse(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Browse:
     return made
 
 
-def test_a_browser_with_a_certificate_gets_the_page(
-    recorded: RecordedRobot, serve: Serve, browse: Browse
-) -> None:
+def test_a_browser_with_a_certificate_gets_the_page(recorded, serve, browse):
     served = serve(recorded, control=True, tls=server_context(ROBOT))
     for role in ("observe", "command"):
         served.browser = browse(role)
@@ -59,9 +49,7 @@ def test_a_browser_with_a_certificate_gets_the_page(
     assert served.ask("/look", {}, Origin=f"https://127.0.0.1:{served.port}")[0] == 200
 
 
-def test_no_byte_of_the_page_without_a_certificate_that_counts(
-    recorded: RecordedRobot, serve: Serve, browse: Browse
-) -> None:
+def test_no_byte_of_the_page_without_a_certificate_that_counts(recorded, serve, browse):
     served = serve(recorded, tls=server_context(ROBOT))
     revoked = browse("observe")
     served.browser = revoked
@@ -77,6 +65,6 @@ def test_no_byte_of_the_page_without_a_certificate_that_counts(
     assert served.ask("/look", {})[0] == 200
 
 
-def test_a_robot_without_a_certificate_is_not_served(browse: Browse) -> None:
+def test_a_robot_without_a_certificate_is_not_served(browse):
     with pytest.raises(InputError, match="make it by `dxlrun keys robot arm`"):
         server_context("arm")

@@ -32,9 +32,6 @@ def lines(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(stream))
 
 
-# Tables
-
-
 def test_parquet_has_every_record_of_the_log_and_names_topics_without_a_file(run, tmp_path, export):
     said = export(run, tmp_path / "out", "parquet", "--json")
     log, result = read_log(run), result_of(said.out)
@@ -149,9 +146,6 @@ def test_time_goes_on_through_the_slices_of_a_log(tmp_path):
     slices = [replace(log, cycles=log.cycles[at : at + 1]) for at in range(len(log.cycles))]
     (rows,) = tables_of(slices, ["/cycle"])
     assert rows.table["time_s"].to_pylist() == pytest.approx([0.0, 0.02, 0.08, 0.1])
-
-
-# What is refused
 
 
 @pytest.mark.parametrize("case", cases(Path(__file__).with_name("refusals.txt")))

@@ -218,9 +218,6 @@ def test_a_data_set_is_the_same_however_the_log_is_sliced(tmp_path):
             np.testing.assert_allclose(values, figures[1][name][key], rtol=1e-9, atol=1e-12)
 
 
-# What is refused
-
-
 # lerobot itself
 
 

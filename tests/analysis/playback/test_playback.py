@@ -151,9 +151,6 @@ def test_a_joint_that_is_lost_ends_it_and_the_others_stay(swing, place, dxlrun, 
     assert np.ptp(sent[:, cycle + 8 :], axis=1).max() < np.radians(0.01)
 
 
-# Rows
-
-
 def motion(position: np.ndarray, seconds: float) -> RecordedMotion:
     times = np.linspace(0.0, seconds, len(position))
     return RecordedMotion(Path("a.mcap"), ("pan",), ("states",), times, position[:, None], 0.0, (ROTARY,))
@@ -203,9 +200,6 @@ def test_a_long_motion_has_fewer_rows_and_one_that_is_too_long_is_refused():
         rows(still, 11000.0)
 
 
-# Sources
-
-
 def test_a_state_that_is_not_valid_is_no_position(swing, tmp_path):
     """A position beside a lost reply is the one before it; a loss of more than 1 s is no motion."""
     pan, tilt = (read_log(swing).joints.index(joint) for joint in ("pan", "tilt"))
@@ -224,9 +218,6 @@ def test_way_to_a_goal_with_a_speed_is_played(swing, tmp_path):
     pan = read_log(swing).joints.index("pan")
     log = write_changed(swing, tmp_path / "fast.mcap", put("command_velocity", (slice(None), pan), 3.0))
     assert read_motion(log).what == ("states", "goals")
-
-
-# Ended early
 
 
 def test_ctrl_c_brings_the_joints_to_rest_and_ends_the_run(swing, place, dxlrun, monkeypatch):

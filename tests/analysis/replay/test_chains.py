@@ -1,7 +1,4 @@
-"""A replay of chains has no difference, and names the reference that differs where there is one.
-
-CI tries 8 random runs; `pytest --campaign=release tests/analysis/replay/test_chains.py` tries more.
-"""
+"""A replay of chains has no difference, and names the reference that differs where there is one."""
 
 from collections.abc import Mapping
 from functools import cache, partial

@@ -31,9 +31,6 @@ STATE = "/all_inputs/state"
 COMMAND, GOAL = "command of the {}", "goal of the {}, after the last gate"
 
 
-# Values of cycles
-
-
 @pytest.mark.parametrize("field", ["command_position", "command_velocity", "goal_position", "goal_velocity"])
 @pytest.mark.parametrize("bit", [0, 31, 52, 63])
 def test_one_bit_of_one_value_is_named(pair_log, changed, field, bit):
@@ -147,9 +144,6 @@ def test_plan_that_the_file_no_longer_gives(pair_log, changed):
     log = changed(pair_log, plan(lambda content: content["loop"]["joints"][1].update(upper=0.5)))
     with pytest.raises(InputError, match="now compiles to a different plan"):
         replay_log(log, (), {"speed": "5 rad/s"})
-
-
-# Messages of topics
 
 
 def flip_message(index: int, at: int, bit: int = 0) -> Change:

@@ -21,7 +21,6 @@ from tests.kit.pages import page_text
 from tests.kit.stories import differing, replayed, silence
 from tests.kit.totals import totals_of
 
-from dxlrun.cli import main
 from dxlrun.compile.robot_compiler import compile_files
 from dxlrun.errors import InputError, LogError
 from dxlrun.log.log_reader import read_log
@@ -177,47 +176,43 @@ def test_times_that_a_schedule_cannot_have_are_refused(log):
     assert np.diff(read.cycles["scheduled_ns"]).max() > PERIOD_NS
 
 
-ROOT = Path(__file__).parents[3]
 TEXT = page_text("replay.md")
 COMMANDS = [line.strip() for line in TEXT.splitlines() if line.startswith("    dxlrun ")]
 OUTPUTS = re.findall(r"```\n(.*?)```", TEXT, re.DOTALL)
 
 
-def test_the_document_shows_the_output(tmp_path, monkeypatch, capsys):
-    (tmp_path / "robots").symlink_to(ROOT / "robots")
+def test_the_document_shows_the_output(tmp_path, monkeypatch, dxlrun):
+    (tmp_path / "robots").symlink_to(ROBOTS)
     monkeypatch.chdir(tmp_path)
-    codes, said = [], []
+    said = []
     for line in COMMANDS:
         (log,) = sorted(Path("logs").glob("*.mcap"))[:1] or [tmp_path]
-        codes.append(main(line.replace(" LOG", f" {log}").split()[1:]))
-        said.append(capsys.readouterr())
-    assert codes == [0, 0, 1, 0, 0, 0], said
+        said.append(dxlrun(*line.replace(" LOG", f" {log}").split()[1:]))
+    assert [one.code for one in said] == [0, 0, 1, 0, 0, 0], said
     logs = re.compile(r"logs/[^\s,]+")
     shown = [logs.sub("LOG", one.out).split() for one in said]
     assert shown[1:-1] == [output.split() for output in OUTPUTS]
     assert [one.err for one in said[1:3]] == ["", ""]
 
 
-def test_json_is_for_programs(pair_log, capsys):
-    assert main(["replay", str(pair_log), "--json"]) == 0
-    report = result_of(capsys.readouterr().out)
+def test_json_is_for_programs(pair_log, dxlrun):
+    report = result_of(dxlrun("replay", pair_log, "--json").out)
     assert (report["same"], report["compared"], report["first"]) == (True, 50, None)
-    code = main(["replay", str(pair_log), "--json", "--set", "all_inputs.gain=0.5"])
-    report = result_of(capsys.readouterr().out)
-    assert (code, report["same"]) == (1, False)
+    said = dxlrun("replay", pair_log, "--json", "--set", "all_inputs.gain=0.5")
+    report = result_of(said.out)
+    assert (said.code, report["same"]) == (1, False)
     assert (report["first"]["cycle"], report["first"]["joint"]) == (0, "tilt")
     assert len(report["joints"]) == 2
 
 
-def test_remarks_go_to_stderr(pair_log, changed, capsys):
-    log = changed(pair_log, versions(numpy="1.0"), no_commands(), put("active", 2, 0))
-    assert main(["replay", str(log)]) == 1
-    said = capsys.readouterr()
+def test_remarks_go_to_stderr(pair_log, changed, dxlrun):
+    said = dxlrun("replay", changed(pair_log, versions(numpy="1.0"), no_commands(), put("active", 2, 0)))
+    assert said.code == 1
     assert said.out.splitlines() == [
         "pair: 1 of 10 replayed cycles differs",
         "first: cycle 2, 0.040 s, controller states: recorded not active, replayed active",
     ]
-    version, gap = said.err.splitlines()
+    version, gap = said.errors
     assert version.startswith("pair: numpy has version 1.0 in the run and ")
     assert gap.startswith("pair: the log lacks a command of cycle 10")
 

@@ -1,7 +1,4 @@
-"""A replay of a steered run has no difference: what clients asked, they ask of the same cycles again.
-
-CI tries 4 random runs; `pytest --campaign=release tests/analysis/replay/test_steered.py` tries more.
-"""
+"""A replay of a steered run has no difference: what clients asked, they ask of the same cycles again."""
 
 from collections.abc import Callable
 from dataclasses import replace

@@ -3,7 +3,6 @@
 import json
 import re
 from html.parser import HTMLParser
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,8 @@ import pytest
 from tests.kit.made_logs import Cycle, Said, Wire, made_log
 
 from dxlrun.channels.event_records import EventCode, Severity
-from dxlrun.log.log_reader import read_log
+from dxlrun.log import log_reader, log_writer
+from dxlrun.log.log_reader import Log, LogReader, open_log, read_log
 from dxlrun.output.json import json_text
 from dxlrun_analysis.page.report_page import analyzed_page
 from dxlrun_analysis.report import analyze, tables
@@ -60,8 +60,7 @@ def data(text: str, name: str) -> Any:
     return json.loads(inside)
 
 
-def made(path: Path) -> Made:
-    log = read_log(path)
+def made(log: Log | LogReader) -> Made:
     text = analyzed_page(log)[1]
     return text, Reader(text)
 
@@ -87,13 +86,18 @@ def run(tmp_path_factory):
         Said(EventCode.SCHEDULER, Severity.INFO, "all memory is locked", "guardian"),
         Said(EventCode.CONTROLLER_FAULT, Severity.ERROR, "</script><b>ValueError</b> & \x1b[31m"),
     ]
-    written: Path = made_log(tmp_path_factory.mktemp("run"), cycles, packets, events)
-    return written
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(log_writer, "CHUNK_BYTES", 1000)
+        return made_log(tmp_path_factory.mktemp("run"), cycles, packets, events)
 
 
 @pytest.fixture(scope="module")
 def whole(run):
-    return made(run)
+    """The page of the log, which is read in slices."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(log_reader, "SLICE_BYTES", 1)
+        assert sum(1 for _ in open_log(run).slices()) > 2
+        return made(open_log(run))
 
 
 def without_library(text: str) -> str:
@@ -101,6 +105,10 @@ def without_library(text: str) -> str:
     scripts = re.findall(r"<script>.*?</script>", text, re.DOTALL)
     assert len(scripts) == 2
     return text.replace(max(scripts, key=len), "")
+
+
+def test_the_page_of_a_log_read_in_slices_is_that_of_the_whole(run, whole):
+    assert whole[0] == analyzed_page(read_log(run))[1]
 
 
 def test_the_page_is_well_formed_and_loads_nothing(whole):
@@ -211,9 +219,9 @@ def test_a_text_from_the_log_stays_a_text(whole):
 
 def test_a_log_of_nothing_but_nan_and_one_that_is_cut_give_a_page(write, run, tmp_path):
     nan = float("nan")
-    _, reader = made(write([Cycle(n, position=nan, goal=nan, valid=False) for n in range(3)]))
+    _, reader = made(read_log(write([Cycle(n, position=nan, goal=nan, valid=False) for n in range(3)])))
     assert "No goal was sent, or no position was read." in reader.words("figcaption")
     cut, data = tmp_path / "cut.mcap", run.read_bytes()
     cut.write_bytes(data[: len(data) * 2 // 3])
-    _, reader = made(cut)
+    _, reader = made(read_log(cut))
     assert any("ends early" in text or "cannot be read" in text for text in reader.words("p"))

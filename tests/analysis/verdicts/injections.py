@@ -245,9 +245,6 @@ def hand_over_late(story: Story, since_s: float, ms: float, for_s: float, period
     story.prepared.append(lambda: [story.hold_back(bus, late_ns) for bus in story.virtual.buses])
 
 
-# Contacts
-
-
 @line("(?:<joint>(?:, )?)+ (?:is|are) cut off for <n> s every <n> s", cut)
 def cut_off(story: Story, t_s: float, joint: str, _: str, for_s: float, period_s: float) -> bool:
     return t_s % period_s < for_s
@@ -270,9 +267,6 @@ def miss_each(story: Story, t_s: float, joint: str, each: float, _: str) -> bool
 )
 def miss_some(story: Story, t_s: float, joint: str, percent: float, _: str, speed: float | None) -> bool:
     return (speed is None or abs(story.servo(joint).velocity) > speed) and story.happens(percent)
-
-
-# Other hosts
 
 
 @line(

@@ -1,7 +1,5 @@
 """One simulated joint with known properties, measured on virtual time."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """`dxlrun characterize` as a command: on virtual time, on a run of its own, and refused."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,10 +1,4 @@
-"""`dxlrun characterize` finds what simulated servos were given: response, rate, dead band, speed, gaps.
-
-The truths come from the simulation: its settings, formulas on them, or its own shaft looked at closely.
-CI has one model for each; the campaign has the others.
-"""
-
-from __future__ import annotations
+"""`dxlrun characterize` finds what simulated servos were given: settings, formulas on them, or shafts."""
 
 import functools
 import itertools
@@ -99,9 +93,6 @@ def test_a_trace_has_the_times_at_which_the_servo_had_goals_and_positions(measur
         assert max(np.abs(ends - origin_ns - time * 1e9).min() for time in times) < 20_000
 
 
-# Rate
-
-
 @known("model write_ms", ("XM430-W350", 3), ("AX-12A", 2), ("AX-12A", 5), ("MX-64", 4), ("XL430-W250", 1))
 def test_the_rate_is_that_at_which_the_servo_can_just_answer(measures, model, write_ms):
     """A read must end after the servo's time for the goal before it, which is the longer instruction."""
@@ -119,9 +110,6 @@ def test_a_slow_bus_is_named_as_what_limits_the_rate(measures):
     figure = done.figure(rates.NAME)
     assert figure.value == pytest.approx(done.rig.plan.buses[0].budget.highest_rate_hz, rel=0.01)
     assert figure.limit.startswith("the bus: at 57600 bit/s")
-
-
-# Response
 
 
 def risen_s(model: str, delay_ns: int, step: float) -> float:
@@ -165,9 +153,6 @@ def test_a_response_that_few_loop_rates_show_is_within_its_interval(measures, mo
     assert first.value >= 0
 
 
-# Speed
-
-
 @known(
     "model register ticks",
     ("XM430-W350", "profile_acceleration", 60),
@@ -190,9 +175,6 @@ def test_the_top_speed_without_a_profile_is_the_motors(measures, model):
     # its goals move as fast as the manual's no-load speed, which most of these motors have
     assert done.figure(speeds.TOP).value == pytest.approx(motor.no_load_speed, rel=FIVE_PERCENT)
     assert done.figure(speeds.ACCELERATION).value is not None
-
-
-# Dead band
 
 
 def resting_error(bus: SimulatedBus, friction: float) -> float:
@@ -229,9 +211,6 @@ def test_the_dead_band_is_margin_and_friction_over_the_gain(measures, model, fri
         assert band.limit.startswith(f"{margin:.2f} deg by the compliance margin")
     else:
         assert "the model has no compliance margin" in band.limit
-
-
-# Gaps
 
 
 @functools.cache

@@ -1,7 +1,5 @@
 """What cannot be measured is reported with the reason, and not invented."""
 
-from __future__ import annotations
-
 import math
 from fractions import Fraction
 from typing import Any

@@ -1,7 +1,5 @@
 """Which joints an experiment may move, and how far: what is wrong is refused in a sentence each."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 
@@ -10,7 +8,7 @@ import pytest
 from dxlrun.errors import InputError
 from dxlrun.testing import plan_of
 from dxlrun_lab.commands.on_robot import RobotFileArguments
-from dxlrun_lab.guided.choice import check_joints, parse_ranges, situation_of, whole_situation
+from dxlrun_lab.guided.choice import parse_ranges, situation_of, whole_situation
 from dxlrun_lab.guided.virtual_rig import virtual_rig
 
 ROBOT = """\
@@ -56,65 +54,14 @@ def test_whole_range_is_that_of_the_limits_with_room_for_an_overshoot(rig):
     assert [math.degrees(end) for end in (joint.lower, joint.upper)] == pytest.approx([-25, 95], abs=0.1)
 
 
-@pytest.mark.parametrize(
-    ("names", "degrees", "sentences"),
-    [
-        (
-            ["narrow", "wheel", "limp"],
-            (-30, 20),
-            [
-                "--range narrow=-30..20 deg is beyond the joint's limits of -20 to 90 deg; stay inside",
-                "joint wheel has no position limits; give --range, such as wheel=-30deg..30deg",
-            ],
-        ),
-        (
-            ["narrow", "limp"],
-            (10, 60),
-            [
-                "joint narrow is at 0 deg, outside of its --range; move the joint inside first",
-                "joint limp (ID 3 on bus main) is limp; enable its torque first: dxlrun torque on limp",
-            ],
-        ),
-    ],
-)
-def test_everything_that_is_wrong_with_ranges_is_refused_at_once(rig, names, degrees, sentences):
+def test_joint_outside_of_its_range_or_without_torque_is_refused(rig):
+    """Other refusals are in tests/cli/refusals.txt."""
     with pytest.raises(InputError) as caught:
-        situation_of(rig, names, {"narrow": tuple(map(math.radians, degrees))})
-    assert list(caught.value.sentences) == sentences
-
-
-@pytest.mark.parametrize(
-    ("word", "sentence"),
-    [
-        ("elbow", "write JOINT=LOWEST..HIGHEST, such as elbow=-30deg..30deg"),
-        ("elbow=3deg", "write JOINT=LOWEST..HIGHEST, such as elbow=-30deg..30deg"),
-        ("elbow=3..5deg", "'3' has no unit; write an angle with its unit"),
-        ("elbow=5deg..3deg", "set HIGHEST at least 2 deg above LOWEST"),
-        ("elbow=3deg..4deg", "set HIGHEST at least 2 deg above LOWEST"),
-        ("elbow=nan deg..3deg", ""),
-    ],
-)
-def test_wrong_words_are_refused(word, sentence):
-    with pytest.raises(InputError) as caught:
-        parse_ranges([word, "wrist"])
-    first, second = caught.value.sentences
-    assert first.startswith(f"--range {word}: {sentence}")
-    assert second.startswith("--range wrist: ")
-    with pytest.raises(InputError, match="--range a is given twice; give it once"):
-        parse_ranges(["a=1deg..9deg", "a=1deg..9deg"])
-
-
-def test_wrong_names_are_refused(rig):
-    joints = rig.plan.loop.joints
-    with pytest.raises(InputError) as caught:
-        check_joints(["narow", "limp", "limp"], {"limp": (0, 1), "narrow": (0, 1)}, joints)
+        situation_of(rig, ["narrow", "limp"], {"narrow": (math.radians(10), math.radians(60))})
     assert caught.value.sentences == (
-        "narow is not one of the robot's joints; did you mean narrow?",
-        "joint limp is named twice; name it once",
-        "--range narrow: joint narrow is not in the experiment; name the joint, too",
+        "joint narrow is at 0 deg, outside of its --range; move the joint inside first",
+        "joint limp (ID 3 on bus main) is limp; enable its torque first: dxlrun torque on limp",
     )
-    with pytest.raises(InputError, match="name the joints that may move: narrow, wheel, limp"):
-        check_joints([], {}, joints)
 
 
 def test_words_are_a_robot_file_its_arguments_and_joints():

@@ -1,7 +1,5 @@
 """Experiments on runs with all their processes: one that was there before, and ones of their own."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

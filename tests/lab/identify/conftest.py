@@ -1,9 +1,6 @@
 """Runs of simulated servos for identifications: recorded once, with noise of seeds, spoilt by a test."""
 
-from __future__ import annotations
-
 import functools
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -65,9 +62,6 @@ class Run:
         cycles["effort"][:, 0] += random.normal(0.0, spread, len(cycles))
         cycles["voltage"][:, 0] = np.round(cycles["voltage"][:, 0] + random.normal(0.0, 0.05, len(cycles)), 1)
         return cycles
-
-
-Record = Callable[..., Run]
 
 
 @pytest.fixture(scope="session")

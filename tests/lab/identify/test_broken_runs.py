@@ -1,7 +1,5 @@
 """What does not determine a servo is refused in one sentence that says what is missing, or said beside it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

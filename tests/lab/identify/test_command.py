@@ -1,7 +1,5 @@
 """`dxlrun identify` on the command line: on virtual time, of a log, and what it refuses."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The excitation stays within range and limits, and says what is too small for it."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -8,8 +8,6 @@ of a real XL330-M288 (a weight of 0.49 kg at 0.1 m, 6 s each) are not in this re
         python -m pytest tests/lab/identify/test_published.py -q
 """
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math

@@ -1,12 +1,4 @@
-"""`dxlrun identify` finds the constants of simulated motors, which are facts of published identifications.
-
-CI identifies an XL330 from 14 s (and test_published.py an MX-64); the campaign each model from the 60 s that
-are the default, and counts how often the intervals have the true value:
-
-    pytest --campaign=release tests/lab/identify/test_recovery.py
-"""
-
-from __future__ import annotations
+"""`dxlrun identify` finds the constants of simulated motors, whose intervals hold as often as they claim."""
 
 import numpy as np
 import pytest

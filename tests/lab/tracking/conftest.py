@@ -1,7 +1,5 @@
 """Runs of the experiment on virtual time, where wake-ups are late by injected times."""
 
-from __future__ import annotations
-
 import itertools
 import random
 from collections.abc import Iterator

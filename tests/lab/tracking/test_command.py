@@ -1,7 +1,5 @@
 """`dxlrun experiment tracking`: a whole run, its page, and what becomes of wrong words and failed runs."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """What is measured: drift, lateness and error, against delays that were injected."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -155,9 +153,6 @@ def test_a_run_that_was_stopped_is_measured_as_far_as_it_came(runs, setup):
     assert one.drift_ns is one.own_drift_ns is None
     assert one.cycles == pytest.approx(160, abs=3)
     assert one.rms_rad > 0
-
-
-# The desired motion
 
 
 def test_between_samples_the_desired_motion_is_the_formula(motion_file):
