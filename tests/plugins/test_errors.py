@@ -3,10 +3,7 @@
 `plain/mistakes.txt` has changes of the example's two modules, and the sentence for each.
 """
 
-from __future__ import annotations
-
 import sys
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -24,13 +21,9 @@ MISTAKES = [
     for case in read_cases(PLAIN / "mistakes.txt")
 ]
 
-Printed = Callable[..., list[str]]
-
 
 @pytest.fixture
-def printed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> Iterator[Printed]:
+def printed(tmp_path, monkeypatch, capsys):
     """Install the example with some text replaced, check its robot file, return the lines of the errors."""
     monkeypatch.chdir(tmp_path)
 
@@ -59,7 +52,7 @@ def printed(
 
 
 @pytest.mark.parametrize(("old", "new", "sentence"), MISTAKES)
-def test_a_plugin_that_is_wrong(printed: Printed, old: str, new: str, sentence: str) -> None:
+def test_a_plugin_that_is_wrong(printed, old, new, sentence):
     (line,) = printed(old.replace("\\n", "\n"), new.replace("\\n", "\n"))
     if sentence.startswith("plug-in "):
         before, mark, after = line.partition("plug-in easing ")
@@ -70,7 +63,7 @@ def test_a_plugin_that_is_wrong(printed: Printed, old: str, new: str, sentence: 
     assert line == sentence or (sentence.endswith("...") and line.startswith(sentence[:-3]))
 
 
-def test_a_plugin_that_is_not_installed(printed: Printed) -> None:
+def test_a_plugin_that_is_not_installed(printed):
     (line,) = printed(install=False)
     assert line.startswith(f"example.yaml:12:16: {NOT_OFFERED}")
     assert line.endswith("?") or "install its package in this environment" in line

@@ -1,12 +1,9 @@
 """JointController and single files: whole controllers in a few lines, and one sentence for a wrong one."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import ClassVar
 
@@ -15,6 +12,8 @@ import pytest
 from jsonschema import Draft202012Validator
 from tests.kit.answers import result_of
 from tests.kit.awaited import DEADLINE_S, until
+from tests.kit.cases import case_parameters
+from tests.kit.commands import matches
 from tests.kit.stages import Stage
 
 from dxlrun import Floats, InputError, JointController, connect, reading, running
@@ -40,11 +39,10 @@ joints: {pan: {id: 1}, tilt: {id: 2}}
 controllers:
   head: {type: ./wave.py:Wave, joints: [pan, tilt], frequency: 2 Hz}
 """
-Written = Callable[..., Path]
 
 
 @pytest.fixture
-def written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Written:
+def written(tmp_path, monkeypatch):
     """Write wave.py with some text replaced, and a robot file that uses it; return the robot file."""
     monkeypatch.chdir(tmp_path)
 
@@ -57,7 +55,7 @@ def written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Written:
     return write
 
 
-def test_three_short_controllers_run_and_replay_bit_for_bit(tmp_path: Path) -> None:
+def test_three_short_controllers_run_and_replay_bit_for_bit(tmp_path):
     log = tmp_path / "run.mcap"
     robot = simulated_robot(SHORT / "short.yaml", duration_s=1.0, log=log)
     assert robot.run().detail == ""
@@ -70,7 +68,7 @@ def test_three_short_controllers_run_and_replay_bit_for_bit(tmp_path: Path) -> N
     assert replay_log(log).sentence == "short: 100 cycles replayed, 0 differences"
 
 
-def test_code_of_a_log_is_executed_only_on_request(written: Written) -> None:
+def test_code_of_a_log_is_executed_only_on_request(written):
     file, log = written("", "\nimport pathlib\npathlib.Path('ran').write_text('')\n"), Path("run.mcap")
     simulated_robot(file, duration_s=0.3, log=log).run()
     Path("ran").unlink()
@@ -98,7 +96,7 @@ def test_code_of_a_log_is_executed_only_on_request(written: Written) -> None:
     assert replay_log(log, code="log").same
 
 
-def test_changed_code_that_wants_another_joint_is_refused(written: Written) -> None:
+def test_changed_code_that_wants_another_joint_is_refused(written):
     file, log = written(), Path("run.mcap")
     simulated_robot(file, duration_s=0.3, log=log).run()
     written("class Wave", "class Other(JointController):\n    pass\n\n\nclass Another")
@@ -106,9 +104,7 @@ def test_changed_code_that_wants_another_joint_is_refused(written: Written) -> N
         replay_log(log, code="current")
 
 
-def test_loop_gateway_and_a_replay_of_a_whole_run_have_it(
-    written: Written, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_loop_gateway_and_a_replay_of_a_whole_run_have_it(written, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     program = "import sys; from dxlrun.cli import main; sys.exit(main())"
     words = [sys.executable, "-c", program, written(), "--duration", "60"]
@@ -125,7 +121,7 @@ def test_loop_gateway_and_a_replay_of_a_whole_run_have_it(
     assert replay_log(next(Path("logs").glob("*.mcap")), code="log").same
 
 
-def test_its_fields_are_parameters_with_units_that_a_client_changes(written: Written) -> None:
+def test_its_fields_are_parameters_with_units_that_a_client_changes(written):
     link = VirtualLink(plan_of(written()))
     robot = RemoteRobot("short", link)
     try:
@@ -139,7 +135,7 @@ def test_its_fields_are_parameters_with_units_that_a_client_changes(written: Wri
         link.close()
 
 
-def test_check_shows_it_and_an_editor_takes_it(written: Written, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_shows_it_and_an_editor_takes_it(written, capsys):
     assert main(["check", str(written()), "--json"]) == 0
     (shown,) = result_of(capsys.readouterr().out)["controllers"]
     entry = json.loads((SHORT.parents[2] / "robots/robot.schema.json").read_text())["$defs"][
@@ -162,9 +158,7 @@ def test_check_shows_it_and_an_editor_takes_it(written: Written, capsys: pytest.
         ("./pipe.py:Wave", "pipe.py of controller head cannot be read (this is not a regular file)"),
     ],
 )
-def test_only_files_beside_the_robot_file_are_read(
-    written: Written, tmp_path_factory: pytest.TempPathFactory, kind: str, sentence: str
-) -> None:
+def test_only_files_beside_the_robot_file_are_read(written, tmp_path_factory, kind, sentence):
     """Other mistakes are in `tests/compile/cases/single_file.txt`."""
     file = written(robot=ROBOT.replace("./wave.py:Wave", kind))
     outside = tmp_path_factory.mktemp("outside") / "out.py"
@@ -178,39 +172,10 @@ def test_only_files_beside_the_robot_file_are_read(
     assert "\n" not in str(refused.value)
 
 
-FAULTS = {
-    "None": ("None", "returned None from positions; return an array of 2 numbers, one per joint (pan, tilt)"),
-    "a number": ("0.5", "returned 0.5 from positions; return an array of 2 numbers"),
-    "three": ("np.zeros(3)", "returned an array of shape (3,) from positions; "),
-    "words": ("['a', 'b']", "returned ['a', 'b'] from positions; "),
-    "NaN": ("self.start * [1, np.nan]", "returned NaN for tilt from positions; return a number"),
-    "NaN later": (
-        "self.start + (np.nan if time > 0.1 else 0)",
-        "commanded pan/position = nan after a finite value",
-    ),
-    "infinity": ("self.start + np.inf", "commanded pan/position = inf"),
-    "what raises": (
-        "self.start + self.amplitud",
-        "raised in update: AttributeError: 'Wave' object has no attribute 'amplitud' (wave.py:",
-    ),
-    "a field that is set": (
-        "setattr(self, 'amplitude', 1.0)",
-        "raised in update: AttributeError: amplitude is a parameter; only the robot file and clients"
-        " change it (wave.py:",
-    ),
-    "a shape that numpy refuses": (
-        "self.start + np.linalg.inv(np.ones(3))",
-        "raised in update: LinAlgError: 1-dimensional array given. Array must be at least two-dimensional"
-        " (wave.py:",
-    ),
-}
-
-
-@pytest.mark.parametrize("wrong", FAULTS)
-def test_a_wrong_result_ends_the_controller_by_the_policy_of_a_fault(written: Written, wrong: str) -> None:
-    law, sentence = FAULTS[wrong]
-    robot = simulated_robot(written(LAW, law), duration_s=0.3)
-    assert f"controller head {sentence}" in robot.run().detail
+@pytest.mark.parametrize("case", case_parameters(SHORT / "faults.txt"))
+def test_a_wrong_result_ends_the_controller_by_the_policy_of_a_fault(written, case):
+    robot = simulated_robot(written(LAW, case.name), duration_s=0.3)
+    assert matches(f"...controller head {case.lines[0].text}...", robot.run().detail)
 
 
 class Lean(JointController):
@@ -237,7 +202,7 @@ class Quick(Lean):
         return np.full(2, self.speed * dt)
 
 
-def test_what_it_is_sent_in_its_first_cycle_is_not_lost() -> None:
+def test_what_it_is_sent_in_its_first_cycle_is_not_lost():
     class Follow(JointController):
         def begin(self) -> None:
             self.goal = self.start
@@ -253,7 +218,7 @@ def test_what_it_is_sent_in_its_first_cycle_is_not_lost() -> None:
     assert stage.update(0.0).tolist() == [0.1, 0.2]
 
 
-def test_it_begins_when_all_that_it_reads_is_known_and_time_counts_from_there() -> None:
+def test_it_begins_when_all_that_it_reads_is_known_and_time_counts_from_there():
     stage = Stage(Quick, {"joints": ["a", "b"], "other": "hip/position"}).activate()
     assert stage.interfaces.reads == ("hip/position", "ankle/position")
     assert stage.interfaces.command == ("position", "velocity")
@@ -266,7 +231,7 @@ def test_it_begins_when_all_that_it_reads_is_known_and_time_counts_from_there() 
     assert stage.update(4.0, follow=False).tolist() == [0.3 + 2.0, -0.2 + 2.0]
 
 
-def test_it_waits_for_a_joint_that_was_not_heard_yet() -> None:
+def test_it_waits_for_a_joint_that_was_not_heard_yet():
     class Hold(JointController):
         def positions(self, time: float, dt: float) -> Floats:
             return self.start + 0.0
@@ -278,7 +243,7 @@ def test_it_waits_for_a_joint_that_was_not_heard_yet() -> None:
     assert stage.update(0.1, follow=False).tolist() == [0.25, 0.7]
 
 
-def test_names_of_the_entry_are_no_fields_and_the_class_fits_the_contract() -> None:
+def test_names_of_the_entry_are_no_fields_and_the_class_fits_the_contract():
     assert set(ControllerEntry.model_fields) - {"parameters"} <= set(_TAKEN)
     assert controller_breach(Quick) is None
 
@@ -293,9 +258,7 @@ FIRST_WORDS = {
 @pytest.mark.parametrize(
     ("word", "to"), [("print", "terminal"), ("a log record", "pipe"), ("a warning of numpy", "file")]
 )
-def test_the_first_output_of_a_controller_starts_no_thread_in_its_call(
-    written: Written, word: str, to: str
-) -> None:
+def test_the_first_output_of_a_controller_starts_no_thread_in_its_call(written, word, to):
     written(f"return {LAW}", f"{FIRST_WORDS[word]}\n        return {LAW}")
     program = "import sys; from dxlrun.cli import main; sys.exit(main())"
     words = [sys.executable, "-c", program, "robot.yaml", "--virtual", "--duration", "0.1"]
@@ -316,9 +279,7 @@ def test_the_first_output_of_a_controller_starts_no_thread_in_its_call(
     assert ran.returncode == 0, ran.stdout or Path("said").read_text()
 
 
-def test_an_interrupt_that_a_controller_raises_is_its_fault(
-    written: Written, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_an_interrupt_that_a_controller_raises_is_its_fault(written, capfd):
     written(f"return {LAW}", "raise KeyboardInterrupt")
     assert main(["robot.yaml", "--virtual", "--duration", "1"]) == 1
     said = "".join(capfd.readouterr())

@@ -1,13 +1,14 @@
 """What every standard controller promises, whatever its law is."""
 
-from __future__ import annotations
-
 import tracemalloc
 
 import numpy as np
 import pytest
 from tests.kit.campaigns import campaign
-from tests.kit.laws import CONTROLLERS, Case, Story, cases
+from tests.kit.laws import CONTROLLERS, Story, cases
+from tests.kit.stages import Stage
+
+from dxlrun_controllers.joint_state_broadcaster import JointStateBroadcaster
 
 PHYSICS = pytest.mark.needs("physics")
 EACH = pytest.mark.parametrize(
@@ -19,12 +20,12 @@ EACH = pytest.mark.parametrize(
 )
 
 
-def test_no_type_is_left_out() -> None:
+def test_no_type_is_left_out():
     assert {case.type for case in cases()} == set(CONTROLLERS)
 
 
 @EACH
-def test_its_parameters_survive_the_plan_and_an_unknown_key_is_refused(case: Case) -> None:
+def test_its_parameters_survive_the_plan_and_an_unknown_key_is_refused(case):
     model = case.controller.Parameters.model_validate(case.keys)
     assert case.controller.Parameters.model_validate_json(model.model_dump_json()) == model
     with pytest.raises(ValueError, match="Extra inputs are not permitted"):
@@ -33,7 +34,7 @@ def test_its_parameters_survive_the_plan_and_an_unknown_key_is_refused(case: Cas
 
 @EACH
 @campaign(ci=2, night=20, release=200)
-def test_what_was_commanded_once_stays_a_finite_number(case: Case, number: int) -> None:
+def test_what_was_commanded_once_stays_a_finite_number(case, number):
     """The contract: infinity, and NaN behind a number, are its faults, and end it."""
     stage = case.stage()
     if number == 0:  # nothing was heard of any joint yet
@@ -48,7 +49,7 @@ def test_what_was_commanded_once_stays_a_finite_number(case: Case, number: int) 
 
 
 @EACH
-def test_the_same_story_gives_the_same_commands_to_the_bit(case: Case) -> None:
+def test_the_same_story_gives_the_same_commands_to_the_bit(case):
     """A replay computes anew what a run computed."""
     first, second = (list(Story(case.stage().activate(), case, 5).cycles(200)) for _ in range(2))
     np.testing.assert_array_equal(np.array(first).view(np.int64), np.array(second).view(np.int64))
@@ -56,7 +57,7 @@ def test_the_same_story_gives_the_same_commands_to_the_bit(case: Case) -> None:
 
 @EACH
 @campaign(ci=2, night=20, release=200)
-def test_activated_again_it_does_what_a_new_one_does(case: Case, number: int) -> None:
+def test_activated_again_it_does_what_a_new_one_does(case, number):
     old = case.stage().activate()
     story = Story(old, case, number)
     for _ in story.cycles(120):
@@ -83,7 +84,7 @@ def test_activated_again_it_does_what_a_new_one_does(case: Case, number: int) ->
 
 
 @EACH
-def test_no_memory_grows_in_the_loop(case: Case) -> None:
+def test_no_memory_grows_in_the_loop(case):
     stage = case.stage().activate()
     story = Story(stage, case, quiet=True)
     for kind, command in case.asks[-1:]:
@@ -103,3 +104,12 @@ def test_no_memory_grows_in_the_loop(case: Case) -> None:
         assert tracemalloc.get_traced_memory()[0] - before < 4000  # a float a cycle would be 9600
     finally:
         tracemalloc.stop()
+
+
+def test_the_broadcaster_publishes_each_update():
+    robot = Stage(JointStateBroadcaster, {}).activate()
+    assert JointStateBroadcaster.publishes == ("/joint_states",)
+    for time in range(3):
+        robot.update(time)
+    assert len(robot.messages) == 3
+    assert np.isnan(robot.commands.position).all()

@@ -20,8 +20,6 @@ Before the activation: `keys` of the controller, `with` options of its stage (`t
     => refused the text              of a command
 """
 
-from __future__ import annotations
-
 import math
 import re
 from pathlib import Path
@@ -32,7 +30,7 @@ import numpy as np
 import pytest
 import yaml
 from msgspec.structs import replace
-from tests.kit.cases import TextCase, case_parameters
+from tests.kit.cases import case_parameters
 from tests.kit.stages import Stage
 
 from dxlrun import LINEAR, MotorLoad, MotorModel, ServoModel
@@ -235,7 +233,7 @@ class Scene:
 
 
 @pytest.mark.parametrize("case", case_parameters(Path(__file__).with_name("scripts")))
-def test_script(case: TextCase) -> None:
+def test_script(case):
     first = parsed(case.head)
     scene = Scene(first["keys"], first.get("with", {}), first.get("before", {}))
     for place, line, _ in case.lines:
@@ -247,7 +245,7 @@ def test_script(case: TextCase) -> None:
     scene.finish()
 
 
-def test_a_script_that_is_wrong_fails_at_its_line() -> None:
+def test_a_script_that_is_wrong_fails_at_its_line():
     keys = {"type": "joint_group_position_controller", "joints": ["a"]}
     for line in ("at 0 => position 0.4", "=> said hello", "=> reached", "keys {}", "at 0 => effort 1"):
         scene = Scene(keys, {"present": 0.3}, {})

@@ -1,7 +1,5 @@
 """standard-controllers.md: every controller and key is described, snippets are accepted."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path
@@ -21,7 +19,7 @@ TYPES = {name: section for name, section in SECTIONS.items() if name in OFFERS}
 RUNTIME_KEYS = {"type", "active", "rate", "fallback", "into"}
 
 
-def test_every_controller_and_each_of_its_keys_is_described() -> None:
+def test_every_controller_and_each_of_its_keys_is_described():
     parts = json.loads(schema_text("robot", only="dxlrun "))["$defs"]
     named = {name for name in OFFERS if f"`{name}`" in PAGE or name in TYPES}
     assert set(OFFERS) == named
@@ -35,13 +33,13 @@ def test_every_controller_and_each_of_its_keys_is_described() -> None:
 
 
 @pytest.mark.parametrize("name", TYPES)
-def test_snippets_are_accepted(name: str) -> None:
+def test_snippets_are_accepted(name):
     for block in re.findall(r"```yaml\n(.*?)```", TYPES[name], re.DOTALL):
         for entry in yaml.safe_load(block).values():
             kind = OFFERS[entry["type"]].controller
             kind.Parameters.model_validate({key: entry[key] for key in entry if key not in RUNTIME_KEYS})
 
 
-def test_every_robot_is_in_the_table_of_examples() -> None:
+def test_every_robot_is_in_the_table_of_examples():
     named = set(re.findall(r"\(\.\./\.\./robots/(\w+)\.yaml\)", PAGE))
     assert named == {path.stem for path in (ROOT / "robots").glob("*.yaml")}

@@ -1,12 +1,4 @@
-"""Every standard controller when its stream of commands ends, or one of its joints is lost.
-
-Its topics continue, and its joints are held.
-
-Judged by the topics in the log and by the shafts of the simulated servos. A new standard controller needs an
-entry.
-"""
-
-from __future__ import annotations
+"""Every standard controller when its stream ends, or a joint is lost: topics and holds continue."""
 
 import json
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """gravity_compensation: the law against pinocchio, shifts, floating, payload, orientation, mistakes."""
 
-from __future__ import annotations
-
 import importlib.util
 import math
 from pathlib import Path
@@ -46,7 +44,7 @@ URDF = f"""<robot name="arm"><link name="base"/>
 UP = np.array([0.0, 0.0, 1.0])
 
 
-def test_the_law_is_pinocchios() -> None:
+def test_the_law_is_pinocchios():
     pin = pytest.importorskip("pinocchio", reason="pin has 380 MB, so only the extra `full` has it")
     names = ["finger", "b", "a"]  # `rest` is in no robot file: it stays at 0
     law = gravity_law(URDF, names, 3, ("tip", (0.01, 0.02, -0.03)))
@@ -82,7 +80,7 @@ def rod(name: str, mimic: str = "") -> str:
 
 
 @pytest.mark.needs("physics")
-def test_joints_that_mimic_another_move_and_count_for_it() -> None:
+def test_joints_that_mimic_another_move_and_count_for_it():
     """A second rod turns twice as far from 0.5 rad on, a third one against that one."""
     shape = '<collision><origin xyz="0 0 9"/><geometry><box size="1 1 1"/></geometry></collision>'
     text = (
@@ -116,7 +114,7 @@ def needed(q: tuple[float, float], up: np.ndarray = UP, payload: float = 0.0) ->
 
 
 @pytest.mark.needs("physics")
-def test_positions_are_shifted_as_a_feed_forward_shifts_them() -> None:
+def test_positions_are_shifted_as_a_feed_forward_shifts_them():
     """The same weight from a motor file's load: m g l sin(q) at a level axis."""
     urdf = URDF[: URDF.index('<joint name="b"')] + "</robot>"
     one = {"motors": (MOTOR,), "present": (0.7,)}
@@ -145,7 +143,7 @@ def test_positions_are_shifted_as_a_feed_forward_shifts_them() -> None:
 
 @pytest.mark.needs("physics")
 @pytest.mark.parametrize("interface", ["effort", "pwm"])
-def test_an_arm_floats_and_carries_what_is_commanded_beside(interface: str) -> None:
+def test_an_arm_floats_and_carries_what_is_commanded_beside(interface):
     robot = started({"command_interface": interface}, present=(0.5, -0.4))
     torque = needed((0.5, -0.4))
     expected = torque / 1.6 if interface == "effort" else torque * 3.6 / 1.6 / 12.0
@@ -160,7 +158,7 @@ def test_an_arm_floats_and_carries_what_is_commanded_beside(interface: str) -> N
 
 
 @pytest.mark.needs("physics")
-def test_payload_other_joints_and_orientation_count() -> None:
+def test_payload_other_joints_and_orientation_count():
     more = {
         "joints": ["a"],
         "command_interface": "effort",
@@ -186,7 +184,7 @@ def test_payload_other_joints_and_orientation_count() -> None:
 
 
 @pytest.mark.needs("physics")
-def test_a_velocity_is_passed_on() -> None:
+def test_a_velocity_is_passed_on():
     keys: dict[str, Any] = {"limits": {"velocity": 3.0}}
     robot = started({"command_interface": "posvel"}, **keys)
     robot.context.references.velocity[:] = (-0.4, np.nan)
@@ -201,7 +199,7 @@ def test_a_velocity_is_passed_on() -> None:
 # What is missing: `tests/compile/cases/gravity.txt`
 
 
-def test_without_mujoco_it_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_mujoco_it_is_refused(monkeypatch):
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "mujoco" else find(name))
     sentence = r"gravity needs MuJoCo, which is not installed; `pip install 'dxlrun\[physics\]'`"

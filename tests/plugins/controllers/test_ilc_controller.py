@@ -1,14 +1,9 @@
-"""ilc_controller: the error of a repeated motion falls, the correction stays small whatever happens, and the
-next run continues with what was learned. Plants are a delay and a lag with ticks; the law is computed twice.
-"""
-
-from __future__ import annotations
+"""ilc_controller: the error of a repeated motion falls, and the correction stays small whatever happens."""
 
 import itertools
 import math
 import random
 from collections import deque
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -106,7 +101,7 @@ class Learner:
 
 
 @pytest.mark.parametrize("interface", ["position", "posvel"])
-def test_the_error_falls_tenfold_in_ten_repetitions(interface: str) -> None:
+def test_the_error_falls_tenfold_in_ten_repetitions(interface):
     learner = Learner(command_interface=interface, repeated=11)
     errors = learner.errors
     assert errors[0] > 3.0
@@ -118,7 +113,7 @@ def test_the_error_falls_tenfold_in_ten_repetitions(interface: str) -> None:
 
 
 @pytest.mark.parametrize(("keys", "delay_s"), [({}, 4 * PERIOD_S), ({"delay": "30 ms"}, 0.03)])
-def test_the_delay_is_that_of_the_first_repetition_unless_it_is_given(keys: Any, delay_s: float) -> None:
+def test_the_delay_is_that_of_the_first_repetition_unless_it_is_given(keys, delay_s):
     learner = Learner(Servos(delay=3, lag_s=0.001), repeated=1, **keys)
     # a goal is sent at the end of its cycle and read at the start of another: one cycle more than the servo's
     assert learner.learned[0].delay_s == pytest.approx([delay_s] * 2, rel=0.1)
@@ -138,14 +133,14 @@ OTHERS = {
 
 
 @pytest.fixture(scope="module")
-def taught() -> bytes:
+def taught():
     """Return what a controller keeps after six repetitions."""
     kept: bytes = Learner(repeated=6).stage.keeps[-1]
     return kept
 
 
 @pytest.mark.parametrize("name", OTHERS)
-def test_a_swapped_servo_never_lets_the_error_grow_without_bound(name: str, taught: bytes) -> None:
+def test_a_swapped_servo_never_lets_the_error_grow_without_bound(name, taught):
     (fresh,) = Learner(Servos(**OTHERS[name]), gain=0.0, repeated=1).errors
     learner = Learner(Servos(**OTHERS[name]), kept=taught, repeated=14)
     errors = learner.errors
@@ -161,7 +156,7 @@ def test_a_swapped_servo_never_lets_the_error_grow_without_bound(name: str, taug
     assert any("is dropped" in text for text in learner.said) == (errors[0] > 0 and twice)
 
 
-def test_one_bad_repetition_is_ignored_and_a_second_one_drops_what_was_learned() -> None:
+def test_one_bad_repetition_is_ignored_and_a_second_one_drops_what_was_learned():
     learner = Learner(repeated=6)
     before, count = learner.stage.keeps[-1], len(learner.stage.keeps)
     learner.servos.gain = 0.5
@@ -225,7 +220,7 @@ def activate_again(learner: Learner) -> None:
         (activate_again, "it was not played to its end"),
     ],
 )
-def test_a_repetition_that_was_disturbed_is_ignored(happen: Callable[[Learner], None], why: str) -> None:
+def test_a_repetition_that_was_disturbed_is_ignored(happen, why):
     learner = Learner(repeated=2)
     name, table = learner.stage.messages[0][1].motion, learner.stage.keeps[-1]
     learner.send()
@@ -242,14 +237,14 @@ def test_a_repetition_that_was_disturbed_is_ignored(happen: Callable[[Learner], 
     assert learner.repeat() < learner.errors[0] / 2, "the next one is played and learned from as before"
 
 
-def test_a_motion_that_is_too_long_is_played_and_not_learned() -> None:
+def test_a_motion_that_is_too_long_is_played_and_not_learned():
     learner = Learner(longest="3 s", repeated=1)
     assert learner.stage.goal.outcome is Outcome.REACHED
     assert "it is longer than `longest`" in learner.said[-1]
     assert not learner.stage.messages
 
 
-def test_a_motion_that_begins_while_the_one_before_is_learned() -> None:
+def test_a_motion_that_begins_while_the_one_before_is_learned():
     learner = Learner()
     learner.stage.controller._steps = 1  # of 34: they take longer than the way to the first point
     learner.stage.controller._repetition._step = 16
@@ -260,10 +255,7 @@ def test_a_motion_that_begins_while_the_one_before_is_learned() -> None:
     assert any("the previous repetition is still being learned" in text for text in learner.said)
 
 
-# Motions
-
-
-def test_joints_that_a_motion_does_not_move_get_no_correction() -> None:
+def test_joints_that_a_motion_does_not_move_get_no_correction():
     learner = Learner(Servos(gain=0.8, position=np.array([0.0, 0.3])))
     for _ in range(3):
         learner.send(given=[{**each, "positions": each["positions"][:1]} for each in points()], joints=["a"])
@@ -273,7 +265,7 @@ def test_joints_that_a_motion_does_not_move_get_no_correction() -> None:
     assert largest[1] == 0.0
 
 
-def test_each_motion_has_its_own_correction_and_the_oldest_is_forgotten() -> None:
+def test_each_motion_has_its_own_correction_and_the_oldest_is_forgotten():
     learner = Learner(motions=2)
     for phase in (0.0, 1.0):
         for _ in range(4):
@@ -286,7 +278,7 @@ def test_each_motion_has_its_own_correction_and_the_oldest_is_forgotten() -> Non
     assert learner.repeat(0.0) > 2.0, "it was forgotten"
 
 
-def test_a_motion_is_the_same_whenever_it_begins() -> None:
+def test_a_motion_is_the_same_whenever_it_begins():
     made = Stage(IlcController, TWO)
 
     def key(stage: Stage = made, **command: object) -> tuple[float, ...]:
@@ -300,7 +292,7 @@ def test_a_motion_is_the_same_whenever_it_begins() -> None:
 
 
 @pytest.mark.parametrize("end", ["cancel", "next", "same"])
-def test_no_correction_jumps(end: str) -> None:
+def test_no_correction_jumps(end):
     learner = Learner(repeated=5)
     learner.corrections.clear()
     learner.send()
@@ -316,7 +308,7 @@ def test_no_correction_jumps(end: str) -> None:
 
 
 @pytest.mark.parametrize("into", [(), ("below",)])
-def test_the_speed_is_that_of_the_corrected_position(into: tuple[str, ...]) -> None:
+def test_the_speed_is_that_of_the_corrected_position(into):
     learner = Learner(command_interface="posvel", into=into, repeated=4)
     begin = len(learner.commanded)
     learner.repeat()
@@ -329,7 +321,7 @@ def test_the_speed_is_that_of_the_corrected_position(into: tuple[str, ...]) -> N
     assert (np.median(grew, axis=0) > 0.05).all()
 
 
-def test_a_correction_does_not_lead_over_a_limit() -> None:
+def test_a_correction_does_not_lead_over_a_limit():
     learner = Learner(limits={"lower": -0.6, "upper": 0.6}, repeated=4)
     assert np.abs(learner.commanded).max() == 0.6
     assert np.abs(learner.corrections).max() > math.radians(3)
@@ -339,7 +331,7 @@ def test_a_correction_does_not_lead_over_a_limit() -> None:
 # From run to run
 
 
-def test_the_next_run_continues_with_what_was_kept() -> None:
+def test_the_next_run_continues_with_what_was_kept():
     learner = Learner(repeated=4)
     again = Learner(kept=learner.stage.keeps[-1], repeated=2)
     assert again.errors[0] == pytest.approx(learner.repeat(), abs=0.05)
@@ -348,14 +340,14 @@ def test_the_next_run_continues_with_what_was_kept() -> None:
 
 
 @pytest.fixture(scope="module")
-def short() -> bytes:
+def short():
     """Return what a controller of one short motion keeps."""
     kept: bytes = Learner(motions=1, longest="4.2 s", repeated=1).stage.keeps[-1]
     return kept
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_damaged_bytes_are_ignored_and_never_raise(seed: int, short: bytes) -> None:
+def test_damaged_bytes_are_ignored_and_never_raise(seed, short):
     chance, data = random.Random(seed), bytearray(short)
     for _ in range(chance.randint(1, 4)):
         at = chance.choice([chance.randrange(60), chance.randrange(len(data))])
@@ -366,7 +358,7 @@ def test_damaged_bytes_are_ignored_and_never_raise(seed: int, short: bytes) -> N
     assert np.abs(again.corrections).max() <= MOST + 1e-6
 
 
-def test_another_period_forgets_and_reports_it(short: bytes) -> None:
+def test_another_period_forgets_and_reports_it(short):
     other = short[:4] + (10_000_000).to_bytes(8, "little") + short[12:]
     again = Learner(motions=1, longest="4.2 s", kept=other)
     assert again.said == [
@@ -375,16 +367,13 @@ def test_another_period_forgets_and_reports_it(short: bytes) -> None:
     assert again.learned == []
 
 
-def test_more_than_can_be_kept_is_refused() -> None:
+def test_more_than_can_be_kept_is_refused():
     with pytest.raises(ValueError, match="lower `motions` or `longest`"):
         Stage(IlcController, TWO | {"longest": "3000 s"})
 
 
-# The law
-
-
 @pytest.mark.parametrize(("cutoff", "period"), [(5.0, 1 / 320), (2.0, 0.001), (8.0, 0.02)])
-def test_the_low_pass_has_no_phase_and_half_the_power_at_its_cut_off(cutoff: float, period: float) -> None:
+def test_the_low_pass_has_no_phase_and_half_the_power_at_its_cut_off(cutoff, period):
     weights = gaussian(cutoff, period)
     turns = np.exp(-2j * np.pi * cutoff * period * (np.arange(len(weights)) - len(weights) // 2))
     passed = np.sum(weights * turns)
@@ -395,7 +384,7 @@ def test_the_low_pass_has_no_phase_and_half_the_power_at_its_cut_off(cutoff: flo
 
 
 @pytest.mark.parametrize("rows", [3, 40, 300, 1000])
-def test_the_steps_give_what_the_formula_gives_at_once(rows: int) -> None:
+def test_the_steps_give_what_the_formula_gives_at_once(rows):
     rng = np.random.default_rng(rows)
     joints, period, gain = 2, 0.005, 0.6
     law = Repetition(joints, 1200, period, 4.0)

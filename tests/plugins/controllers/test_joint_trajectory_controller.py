@@ -75,8 +75,6 @@ def test_posvel_commands_the_magnitude_of_the_desired_velocity(velocities):
         np.testing.assert_allclose(robot.commands.velocity, abs(thesis(time - 1.0)[1]), atol=0.05)
 
 
-# Some joints
-
 ways = st.lists(
     st.tuples(st.sampled_from("abc"), st.floats(0.05, 0.6), st.floats(-1, 1), st.booleans()), max_size=9
 )
@@ -116,9 +114,6 @@ def test_a_spliced_trajectory_leaves_the_one_before_where_it_starts(joints):
     assert robot.goal.ended[0][:2] == (Outcome.REACHED, "after 0.900 s")
 
 
-# Chunks
-
-
 def test_chunks_of_a_policy_are_followed_smoothly_whenever_they_come():
     def wave(t):
         return 0.3 + 0.4 * np.sin(2 * np.asarray(t))
@@ -154,9 +149,6 @@ def test_the_way_into_a_chunk_is_no_faster_than_the_joint_may_move():
     np.testing.assert_allclose(path[-1], 0.0)
 
 
-# Results
-
-
 def test_feedback_comes_ten_times_a_second_with_progress_and_distance():
     robot = started()
     robot.send(0.0, "trajectory", points=one(1.3))
@@ -178,8 +170,6 @@ def test_beginning_a_long_trajectory_copies_none_of_its_points():
     tracemalloc.stop()
     assert peak < data.nbytes / 3
 
-
-# Stops and takeovers
 
 values = st.floats(-1.0, 1.0)
 point = st.tuples(st.floats(0.1, 0.6), st.tuples(values, values), st.tuples(values, values))
@@ -255,9 +245,6 @@ def test_whenever_a_goal_takes_over_position_velocity_and_acceleration_continue(
     if before[1].any():  # from rest, a linear piece begins with its speed: that is what linear means
         np.testing.assert_allclose(after[1], before[1], atol=1e-9)
         np.testing.assert_allclose(after[2], before[2], atol=1e-8)
-
-
-# The speed
 
 
 @pytest.mark.parametrize("period", [0.02, 0.001, 0.25])

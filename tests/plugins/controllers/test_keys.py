@@ -8,8 +8,6 @@
       positions {positions: [1]} => 1 p   a command: refused with these words, with `...` for any others
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -61,7 +59,7 @@ def with_axes(names: list[str]) -> list[str]:
 
 
 @pytest.mark.parametrize(("name", "keys", "given", "expected"), [*cases()])
-def test_controller_claims_or_refuses(name: str, keys: dict[str, Any], given: str, expected: str) -> None:
+def test_controller_claims_or_refuses(name, keys, given, expected):
     controller = type_of(name)
     if given:
         with pytest.raises(ValueError, match=re.escape(expected).replace(r"\.\.\.", ".*")):
@@ -75,7 +73,7 @@ def test_controller_claims_or_refuses(name: str, keys: dict[str, Any], given: st
         assert list(getattr(found, field)) == with_axes(names)
 
 
-def test_a_command_of_another_controller_is_refused() -> None:
+def test_a_command_of_another_controller_is_refused():
     group, other = type_of("joint_group_position_controller"), type_of("joint_group_posvel_controller")
     command = other.Commands["posvel"].model_validate({"positions": [1], "velocities": [1]})
     with pytest.raises(ValueError, match="has no command 'posvel'"):

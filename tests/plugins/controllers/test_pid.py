@@ -1,11 +1,14 @@
-"""The PID law against closed forms, scipy's filters and its own promises."""
+"""The PID law against closed forms, scipy's filters and its own promises; live gains and the state."""
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dxlrun.control.controllers.live_parameters import live_names, value_of, with_values
 from dxlrun_controllers.laws.pid import Pid, Slope
+from dxlrun_controllers.pid_controller import PidController
+from dxlrun_controllers.plugin import dxlrun_controllers
 
 ALL = np.ones(1, dtype=bool)
 NONE = np.zeros(1)
@@ -143,3 +146,22 @@ def test_a_reset_forgets_the_filtered_rate_and_the_time_of_a_silence():
     stepped(pid, np.nan, 7.0, measured=~ALL)
     pid.reset(NONE, NONE, NONE)
     assert stepped(pid, 1.0, 0.05) == pytest.approx(0.05)  # neither 7 s of the integral nor the rate of 4
+
+
+TWO = {"joints": ["a", "b"]}
+
+
+def test_it_is_the_joint_position_controller_too():
+    assert dxlrun_controllers()["joint_position_controller"] == dxlrun_controllers()["pid_controller"]
+
+
+def test_gains_are_live_each_by_its_name_and_those_of_a_mapping_by_joint():
+    model = PidController.Parameters.model_validate(TWO | {"gains": {"p": {"a": 1.0, "b": 2.0}, "i": 0.5}})
+    assert list(live_names(model)) == [f"gains.{name}" for name in ("p.a", "p.b", "i", "d", "feed_forward")]
+    changed = with_values(model, {"gains.p.b": 3.0, "gains.i": 0.0})
+    assert (changed.gains.p, changed.gains.i) == ({"a": 1.0, "b": 3.0}, 0.0)
+    assert model.gains.p == {"a": 1.0, "b": 2.0}
+    assert value_of(changed, "gains.p.b") == 3.0
+    for unknown in ("gains.p", "gains.p.c", "gains.i.a", "output_limit"):
+        with pytest.raises(ValueError, match="is not a live parameter"):
+            with_values(model, {unknown: 1.0})

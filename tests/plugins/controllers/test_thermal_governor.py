@@ -1,9 +1,5 @@
 """thermal_governor: its law, and settings that do not fit; `scripts/governor.txt` has what it commands."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -25,13 +21,13 @@ controllers:
 """
 
 
-def test_torque_is_taken_in_proportion() -> None:
+def test_torque_is_taken_in_proportion():
     temperature = np.array([20.0, 65.0, 70.0, 75.0, 99.0, np.nan])
     scale = torque_scale(temperature, np.full(6, 65.0), np.full(6, 75.0))
     assert scale.tolist() == [1.0, 1.0, 0.5, 0.0, 0.0, 1.0]
 
 
-def test_a_controller_that_is_loaded_or_replayed_is_compared_with_the_robot_too(tmp_path: Path) -> None:
+def test_a_controller_that_is_loaded_or_replayed_is_compared_with_the_robot_too(tmp_path):
     path = tmp_path / "robot.yaml"
     path.write_text(ROBOT)
     loop, plugins = compile_files(path, {}, []).plan.loop, load_plugins()

@@ -1,4 +1,4 @@
-"""diff_drive_controller: kinematics, ramps and odometry against closed forms; `scripts/diff_drive.txt`."""
+"""Bases, grippers and followers against closed forms; single cases are in `scripts`."""
 
 import math
 
@@ -9,6 +9,8 @@ from hypothesis import strategies as st
 from tests.kit.stages import standing
 
 from dxlrun_controllers.diff_drive_controller import AngularLimits, DiffDriveController, LinearLimits, Ramp
+from dxlrun_controllers.gripper_controller import GripperController
+from dxlrun_controllers.leader_follower import LeaderFollower
 
 SEPARATION, RADIUS = 0.16, 0.033
 BASE = {"left": ["l"], "right": ["r"], "separation": "160 mm", "radius": "33 mm"}
@@ -45,9 +47,6 @@ def on_arc(way, angle):
     return r * math.sin(angle), r * 2.0 * math.sin(angle / 2) ** 2
 
 
-# Kinematics
-
-
 @settings(max_examples=100, deadline=None)
 @given(
     asked=st.lists(
@@ -73,12 +72,6 @@ def test_at_the_wheels_limit_it_keeps_its_curve_and_its_ramps(asked):
     now = twist(robot)
     np.testing.assert_allclose(np.abs(robot.commands.velocity).max(), 6.0)
     np.testing.assert_allclose(now[0] / now[1], 0.3 / 2.0)
-
-
-# Time-out
-
-
-# Ramps
 
 
 LIMITS = st.one_of(st.none(), st.floats(0.1, 10))
@@ -144,9 +137,6 @@ def test_through_zero_a_ramp_brakes_with_one_limit_and_accelerates_with_the_othe
     np.testing.assert_allclose(speeds, expected, atol=1e-12)
 
 
-# Odometry
-
-
 @settings(max_examples=200, deadline=None)
 @given(
     arcs=st.lists(
@@ -203,3 +193,66 @@ def test_odometry_of_velocities_is_the_arc_too(source):
     x, y = on_arc(0.2 * 99 * 0.02, 0.5 * 99 * 0.02)
     found = robot.controller._pose
     np.testing.assert_allclose([found.x, found.y, found.heading], [x, y, 0.99], atol=1e-9)
+
+
+GRIPPER = {"joint": "gripper", "effort": 0.4, "speed": "2 rad/s"}
+
+
+def test_progress_never_decreases():
+    robot = standing(GripperController, GRIPPER).activate()
+    goal = robot.ask("grip", position=-0.6)
+    for _ in range(40):
+        robot.states.position[0] = max(-0.6, robot.states.position[0] - 0.04)
+        robot.step()
+    assert len(goal.steps) > 3
+    assert goal.steps == sorted(goal.steps)
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), lost=st.floats(0, 0.4))
+def test_an_object_is_felt_under_noise_and_lost_replies(seed, lost):
+    robot = standing(GripperController, GRIPPER).activate()
+    goal, noise = robot.ask("grip", position=0.6), np.random.default_rng(seed)
+    for _ in range(60):
+        robot.states.position[0] = min(robot.time_ns * 2e-9, 0.3) + 0.0015 * noise.integers(-1, 2)
+        robot.states.velocity[0] = noise.normal(scale=0.2)  # four times the speed of a stall
+        robot.states.valid[0] = noise.random() >= lost
+        robot.step()
+        if goal.outcome is not None:
+            break
+    assert goal.text.startswith("stalled, holds something at ")
+    assert 0.33 <= robot.time_ns * 1e-9 <= 0.65
+
+
+@settings(max_examples=100, deadline=None)
+@given(width=st.floats(0.02, 0.078), shrinking=st.booleans())
+def test_a_width_is_the_inverse_of_its_angle(width, shrinking):
+    sign = -1 if shrinking else 1
+    points = ((-1.0, 0.02), (0.1, 0.03), (0.4, 0.078))
+    table = [{"angle": f"{sign * angle} rad", "width": f"{wide} m"} for angle, wide in points]
+    robot = standing(GripperController, GRIPPER | {"widths": table})
+    angle, effort = robot.prepare("grip", width=width)
+    assert robot.controller._width(angle) == pytest.approx(width, abs=1e-12)
+    assert effort == 0.4
+
+
+TWO = {
+    "pairs": [
+        {"joint": "f", "leader": "l", "scale": -0.5, "offset": "0.2 rad"},
+        {"joint": "g", "leader": "m"},
+    ]
+}
+
+
+@settings(max_examples=50, deadline=None)
+@given(path=st.lists(st.floats(-3, 3), min_size=2, max_size=60))
+def test_in_step_a_command_is_made_of_the_state_of_its_own_cycle(path):
+    robot = standing(LeaderFollower, TWO).activate()
+    followed = 0
+    for position in [0.4, *path]:
+        robot.context.reads[:] = position, 0.1, 0.0, 0.0, 0.0, 0.0
+        robot.step()
+        if robot.controller._in_step.all():
+            np.testing.assert_allclose(robot.commands.position, [-0.5 * position + 0.2, 0.1])
+            followed += 1
+    assert followed >= len(path) - 5
