@@ -11,9 +11,8 @@ import pytest
 from tests.kit.stories import send, tell
 
 from dxlrun.channels.cycle import Torque
-from dxlrun.log.log_reader import read_log
 from dxlrun.plan.loop_plan import JointPlan
-from dxlrun.testing import simulated_robot
+from dxlrun.testing import read_log, simulated_robot
 from dxlrun_analysis.finding import Finding, Rank
 from dxlrun_analysis.joints.following import followed
 from dxlrun_analysis.joints.movement import Movement

@@ -13,10 +13,9 @@ from msgspec import structs
 from tests.kit.made_logs import loop_of, made_log
 
 from dxlrun.channels.cycle import CycleLayout, Torque
-from dxlrun.log.log_reader import Log, read_log
 from dxlrun.output.json import json_text
 from dxlrun.plan.loop_plan import JointPlan
-from dxlrun.testing import simulated_robot
+from dxlrun.testing import Log, read_log, simulated_robot
 from dxlrun_analysis.joints import goal_tracking as module
 from dxlrun_analysis.joints.delay import DelayFit
 from dxlrun_analysis.joints.goal_tracking import JointTracking, TrackingCollector, reachable, tracking

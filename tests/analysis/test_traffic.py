@@ -9,8 +9,7 @@ import pytest
 
 from dxlrun.channels.logged_packets import LoggedPacket
 from dxlrun.log.columns import PacketColumns
-from dxlrun.log.log_reader import read_log
-from dxlrun.testing import simulated_robot
+from dxlrun.testing import read_log, simulated_robot
 from dxlrun_analysis.servos import exchanges as pairing
 from dxlrun_analysis.servos.traffic import Traffic
 from dxlsim.faults.fault import parse_fault

@@ -50,59 +50,53 @@ def test_a_long_error_takes_no_room_from_the_names():
         assert words in shown.getvalue()
 
 
-def test_the_last_error_stays_and_warnings_are_none(lab):
-    """Of a run that begins, and has no cycle yet."""
+class Polled:
+    """A robot that a view asks; without states it has had no cycle yet."""
 
-    class Begins:
-        rows = ("a motor fell off", 40), ("a packet was lost", 30)
+    def __init__(self, *said: tuple[str, int], states: object = None, **info: object) -> None:
+        self.said, self.held, self.changed = said, states, info
 
-        def info(self) -> object:
-            return msgspec.to_builtins(INFO)
+    def info(self) -> object:
+        return msgspec.to_builtins(INFO) | self.changed
 
-        def events(self, after: int) -> object:
-            rows = [
-                EventRow(number, 0.0, "x", how, "loop", text) for number, (text, how) in enumerate(self.rows)
-            ]
-            return msgspec.to_builtins(Events(tuple(rows[after:]), len(rows)))
+    def events(self, after: int) -> object:
+        rows = [EventRow(at, 0.0, "x", how, "loop", text) for at, (text, how) in enumerate(self.said)]
+        return msgspec.to_builtins(Events(tuple(rows[after:]), len(rows)))
 
-        def states(self) -> object:
+    def states(self) -> object:
+        if self.held is None:
             raise Refused("it has had no cycle yet", code=Code.NO_CYCLE)
+        return self.held
 
+
+@pytest.fixture
+def view(lab):
+    """A view of a robot that did not answer, and is polled by the test alone."""
     with closing(RobotView("joint", ADDRESS)) as view:
         view.tried.wait()
         view.close()
         view._replied = time.monotonic() + 3600.0
-        assert view.seen().state == "unreachable"
-        assert view.seen().reason == "joint no longer answers: [Errno 111] Connection refused"
-        for last in (0, 2):
-            assert view._poll_robot(Begins(), last) == 2
-            assert (view.seen().state, view.seen().error, view.seen().voltage) == (
-                "starting",
-                "a motor fell off",
-                None,
-            )
-        view._replied = time.monotonic() - 1.01 * SILENT_S
-        assert (view.seen().state, view.seen().reason) == ("unreachable", "no answer")
+        yield view
 
 
-def test_a_row_has_the_lowest_voltage_and_the_hottest_joint():
-    class Runs:
-        def info(self) -> object:
-            return msgspec.to_builtins(INFO) | {"paused": True}
-
-        def events(self, after: int) -> object:
-            return msgspec.to_builtins(Events((), 0))
-
-        def states(self) -> object:
-            temperature, voltage = np.array([30.0, 41.0, np.nan]), np.array([11.5, 12.0, np.nan])
-            return SimpleNamespace(joints=("hip", "knee", "toe"), temperature=temperature, voltage=voltage)
-
-    with closing(RobotView("joint", ADDRESS)) as view:
-        view.tried.wait()
-        view.close()
-        view._replied = time.monotonic() + 3600.0
-        view._poll_robot(Runs(), 0)
+def test_the_last_error_stays_and_warnings_are_none(view):
+    """Of a run that begins, and has no cycle yet."""
+    assert view.seen().state == "unreachable"
+    assert view.seen().reason == "joint no longer answers: [Errno 111] Connection refused"
+    begins = Polled(("a motor fell off", 40), ("a packet was lost", 30))
+    for last in (0, 2):
+        assert view._poll_robot(begins, last) == 2
         seen = view.seen()
+        assert (seen.state, seen.error, seen.voltage) == ("starting", "a motor fell off", None)
+    view._replied = time.monotonic() - 1.01 * SILENT_S
+    assert (view.seen().state, view.seen().reason) == ("unreachable", "no answer")
+
+
+def test_a_row_has_the_lowest_voltage_and_the_hottest_joint(view):
+    temperature, voltage = np.array([30.0, 41.0, np.nan]), np.array([11.5, 12.0, np.nan])
+    states = SimpleNamespace(joints=("hip", "knee", "toe"), temperature=temperature, voltage=voltage)
+    view._poll_robot(Polled(states=states, paused=True), 0)
+    seen = view.seen()
     assert (seen.state, seen.voltage, seen.temperature, seen.hottest) == ("paused", 11.5, 41.0, "knee")
 
 

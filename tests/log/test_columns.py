@@ -14,11 +14,10 @@ from tests.kit.decoded import decode_log
 from tests.kit.pages import page_text
 
 import dxlrun
-from dxlrun import LogError, open_log
+from dxlrun import InputError, LogError, open_log
 from dxlrun.channels.cycle import CycleRecord
 from dxlrun.channels.logged_packets import PacketBatch
 from dxlrun.channels.ring import Handover, RecordKind
-from dxlrun.errors import InputError
 from dxlrun.log import log_reader, log_writer, schemas
 from dxlrun.log.columns import PacketColumns
 from dxlrun.log.log_reader import read_log

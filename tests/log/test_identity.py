@@ -11,8 +11,7 @@ from tests.kit.awaited import DEADLINE_S
 
 from dxlrun.log import identity
 from dxlrun.log.identity import IDENTITY_NAME, code_hashes, git_state, module_files, package_of
-from dxlrun.log.log_reader import read_log
-from dxlrun.testing import simulated_robot
+from dxlrun.testing import read_log, simulated_robot
 
 ROBOTS = Path(__file__).parents[2] / "robots"
 

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from dxlrun.log import schemas
-from dxlrun.log.log_reader import read_log
 from dxlrun.log.machine import MachineSampler, load_sample
 from dxlrun.messages.cdr import Codec
 from dxlrun.plan.machine_load import LoadMeter, LoadSample, MachineLoad
-from dxlrun.testing import simulated_robot
+from dxlrun.testing import read_log, simulated_robot
 
 PID = 4711
 BEFORE = {

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
 
 from dxlrun import Floats, messages
 from dxlrun.channels.cycle import SCALARS, SEQUENCES, CycleLayout, CycleRecord
@@ -25,19 +27,23 @@ if TYPE_CHECKING:
     from fractions import Fraction
 
 KNOWN = [kind for kind in vars(messages).values() if hasattr(kind, "ros_type")]
-OURS = (schemas.CYCLE, schemas.BUS_PACKETS, schemas.EVENT, schemas.COMMAND, schemas.MACHINE)
-STANDARD = (schemas.JOINT_STATE, schemas.ROS_LOG, schemas.STRING)
 TEXT = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=20)
 FLOATS = st.lists(st.floats(width=64), max_size=5)
 
 
-def read_by_rosbags(kind: MessageType, data: bytes) -> Any:
-    """Return a message as rosbags reads it by our definition, which has its hash; it packs the same bytes."""
+@cache
+def store_of(kind: MessageType) -> Typestore:
+    """Return rosbags with our definition of a message, which has its hash."""
     store = get_typestore(Stores.EMPTY)
     store.register(get_types_from_msg(kind.text, kind.name))
     assert store.hash_rihs01(kind.name) == kind.type_hash
-    found = store.deserialize_cdr(data, kind.name)
-    assert bytes(store.serialize_cdr(found, kind.name)) == data
+    return store
+
+
+def read_by_rosbags(kind: MessageType, data: bytes) -> Any:
+    """Return a message as rosbags reads it; it packs the same bytes."""
+    found = store_of(kind).deserialize_cdr(data, kind.name)
+    assert bytes(store_of(kind).serialize_cdr(found, kind.name)) == data
     return found
 
 

@@ -21,8 +21,7 @@ from dxlrun.log.log_reader import Log, LogFollower, open_log, read_log
 from dxlrun.log.part_writer import PartWriter, open_writer
 from dxlrun.log.schemas import LogHeader
 from dxlrun.plan.recording_plan import PART_END_NAME, PART_NAME, RecordingPlan
-from dxlrun.run.virtual_run import VirtualRobot
-from dxlrun.testing import plan_of
+from dxlrun.testing import VirtualRobot, plan_of
 from dxlrun_analysis.cycles.punctuality import Punctuality
 from dxlwire.clock import VirtualClock
 from dxlwire.packets import PacketKind

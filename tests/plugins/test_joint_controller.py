@@ -16,13 +16,12 @@ from tests.kit.cases import case_parameters
 from tests.kit.commands import matches
 from tests.kit.stages import Stage
 
-from dxlrun import Floats, InputError, JointController, connect, reading, running
+from dxlrun import Floats, InputError, JointController, RemoteRobot, connect, reading, running
 from dxlrun.cli import main
 from dxlrun.contract.joint_controller import _TAKEN
 from dxlrun.control.controllers import single_files
 from dxlrun.control.controllers.plugin_loading import controller_breach
 from dxlrun.description.robot import ControllerEntry
-from dxlrun.remote.client import RemoteRobot
 from dxlrun.testing import plan_of, read_log, simulated_robot
 from dxlrun.tooling.runs import VirtualLink
 from dxlrun_analysis.replay import Setting, replay_log

@@ -9,11 +9,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.kit.stories import Clients, send, silence
+from tests.kit.sampled_run import SampledRun
+from tests.kit.stories import send, silence
 
-from dxlrun import Controller
-from dxlrun.log.log_reader import LogReader, open_log
-from dxlrun.testing import simulated_robot
+from dxlrun import Controller, Floats, LogReader, open_log
 from dxlrun_controllers.plugin import dxlrun_controllers
 
 pytestmark = pytest.mark.long
@@ -24,13 +23,13 @@ RATE, PERIOD_S = 50, 0.02
 FIRST, LAST, END = 25, 75, 200
 """Cycles of the first and the last command, and of the end of the run."""
 LEASE_S = 0.1
-LEASE_OVER_S = LAST * PERIOD_S + LEASE_S
-STILL_S = END * PERIOD_S - 0.5
-"""Time from which the joints rest; a law with feedback has settled."""
+LEASE_OVER = LAST + round(LEASE_S / PERIOD_S)
+STILL = END - 25
+"""Cycle from which the joints rest; a law with feedback has settled."""
 LOST_S = 1.2, 2.4
 """In the stream."""
-NOTICED_S = 0.5
-"""A servo is lost after 50 ms; then the other one comes to rest."""
+NOTICED = 25
+"""Cycles. A servo is lost after 50 ms; then the other one comes to rest."""
 FORCES = ("joint_group_effort_controller", "joint_group_pwm_controller")
 TICK = 2 * np.pi / 4096
 Fields = Callable[[float], dict[str, Any]]
@@ -117,8 +116,8 @@ def controller_of(kind: str) -> type[Controller[Any]]:
     return found
 
 
-def robot_file(folder: Path, kind: str, entry: Entry) -> Path:
-    """Write the robot of an entry; its controller is `own`."""
+def robot_text(kind: str, entry: Entry) -> str:
+    """Return the robot of an entry; its controller is `own`."""
     controllers: dict[str, Any] = {"own": {"type": kind, **entry.keys}}
     if not entry.kind:
         into = {"into": "own"} if entry.below else {}
@@ -138,51 +137,29 @@ def robot_file(folder: Path, kind: str, entry: Entry) -> Path:
         "controllers": controllers,
         "model": {"urdf": str(ROBOTS / "urdf" / "held_arm.urdf")},
     }
-    path = folder / "streamed.yaml"
-    path.write_text(json.dumps(robot))
-    return path
+    return json.dumps(robot)
 
 
-def run(
-    folder: Path,
-    kind: str,
-    entry: Entry,
-    *,
-    lease_s: float = LEASE_S,
-    lost_s: tuple[float, float] | None = None,
-) -> tuple[Path, list[tuple[float, ...]]]:
-    """Run a stream that ends; return the log, and time and shafts every 10 ms.
-
-    `lost_s`: from when and until when the elbow does not answer.
-    """
-    log = folder / "log.mcap"
-    robot = simulated_robot(robot_file(folder, kind, entry), duration_s=END * PERIOD_S, log=log)
-    to = "own" if entry.kind else "mover"
-    plan = next(one for one in robot.plan.loop.controllers if one.name == to)
+def run(folder: Path, kind: str, entry: Entry, *, lease_s: float = LEASE_S) -> SampledRun:
+    """Return the run of a stream that ends, before it begins."""
+    sampled = SampledRun(folder, robot_text(kind, entry), END * PERIOD_S)
+    to, command = "own" if entry.kind else "mover", entry.kind or "positions"
+    plan = next(one for one in sampled.plan.loop.controllers if one.name == to)
     receiver = controller_of(plan.type)
     parameters = receiver.Parameters.model_validate_json(plan.parameters)
-    asked = {}
     for cycle in range(FIRST, LAST + 1, 2):
-        command = entry.kind or "positions"
         fields = receiver.Commands[command].model_validate(entry.fields((cycle - FIRST) * PERIOD_S))
         numbers = receiver.prepare(command, fields, parameters)
-        asked[cycle] = [send(to, command, *numbers, lease_ns=round(lease_s * 1e9))]
-    Clients(robot, asked)
-    seen: list[tuple[float, ...]] = []
-    bus = robot.buses[0]
-    base_ns = robot.clock.now_ns()
-    for ms in range(0, round(END * PERIOD_S * 1000), 10):
-        bus.at(
-            base_ns + ms * 1_000_000,
-            lambda: seen.append(
-                (robot.record.cycle * PERIOD_S, *(bus.servo(one).shaft_angle for one in (1, 2)))
-            ),
-        )
-    if lost_s is not None:
-        silence(robot, [2], *(1000 * at for at in lost_s))
-    result = robot.run()
+        sampled.ask(cycle * PERIOD_S * 1000, send(to, command, *numbers, lease_ns=round(lease_s * 1e9)))
+    return sampled
+
+
+def shafts(sampled: SampledRun) -> Floats:
+    """Run; return the angles of the shafts, rad, a row each period of the loop."""
+    result = sampled.robot.run()
     assert (result.reason, result.detail) == ("ended", ""), result
-    return log, seen
+    began_ms = open_log(sampled.path).columns("/cycle", "scheduled_ns")["scheduled_ns"][0] / 1e6
+    return np.array([sampled.shaft(joint, began_ms) for joint in JOINTS]).T
 
 
 def assert_topics_continue(log: LogReader, kind: str, entry: Entry, gap_s: float = 0.0) -> None:
@@ -208,14 +185,13 @@ def test_every_standard_controller_has_an_entry():
 
 @pytest.mark.parametrize(("kind", "entry"), CASES)
 def test_topics_outlive_a_stream_and_its_joints_are_held(tmp_path, kind, entry):
-    path, shafts = run(tmp_path, kind, entry)
-    log = open_log(path)
+    sampled = run(tmp_path, kind, entry)
+    positions, log = shafts(sampled), open_log(sampled.path)
     assert_topics_continue(log, kind, entry)
-    time, positions = np.array(shafts)[:, 0], np.array(shafts)[:, 1:]
-    before, ended = (positions[time >= at][0] for at in (FIRST * PERIOD_S, LEASE_OVER_S))
+    before, ended = positions[FIRST], positions[LEASE_OVER]
     assert abs(ended - before).max() > 0.05, "the stream moved nothing"
-    assert abs(positions[time >= LEASE_OVER_S] - ended).max() < 0.1
-    assert np.ptp(positions[time >= STILL_S], axis=0).max() <= 2 * TICK
+    assert abs(positions[LEASE_OVER:] - ended).max() < 0.1
+    assert np.ptp(positions[STILL:], axis=0).max() <= 2 * TICK
     if kind == "diff_drive_controller":
         speed = log.columns("/own/odometry", "twist.twist.linear.x")["twist.twist.linear.x"]
         assert speed.max() > 0.09
@@ -225,11 +201,11 @@ def test_topics_outlive_a_stream_and_its_joints_are_held(tmp_path, kind, entry):
 @pytest.mark.parametrize(("kind", "entry"), CASES)
 def test_topics_outlive_a_lost_joint_and_the_other_one_is_held(tmp_path, kind, entry):
     """Efforts and PWM continue, as without them what they hold would fall."""
-    path, shafts = run(tmp_path, kind, entry, lease_s=0.0, lost_s=LOST_S)
-    assert_topics_continue(open_log(path), kind, entry, gap_s=0.1)  # no odometry until a servo counts as lost
-    time, shoulder = np.array(shafts)[:, 0], np.array(shafts)[:, 1]
-    before = np.ptp(shoulder[time < LOST_S[0]])
-    assert before > 0.05, "the stream moved nothing"
+    sampled = run(tmp_path, kind, entry, lease_s=0.0)
+    silence(sampled.robot, [2], *(1000 * at for at in LOST_S))
+    shoulder = shafts(sampled)[:, 0]
+    assert_topics_continue(open_log(sampled.path), kind, entry, gap_s=0.1)  # until a servo counts as lost
+    lost, back = (round(at / PERIOD_S) for at in LOST_S)
+    assert np.ptp(shoulder[:lost]) > 0.05, "the stream moved nothing"
     if "elbow" in str(entry.keys) and kind not in FORCES:
-        held = (time > LOST_S[0] + NOTICED_S) & (time < LOST_S[1])
-        assert np.ptp(shoulder[held]) <= 2 * TICK
+        assert np.ptp(shoulder[lost + NOTICED : back]) <= 2 * TICK

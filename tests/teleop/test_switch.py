@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 from tests.kit.driven import DrivenRobot, changes
 
-from dxlrun import RemoteRobot
-from dxlrun.errors import InputError
+from dxlrun import InputError, RemoteRobot
 from dxlrun_teleop.bank import banks_of
 from dxlrun_teleop.drive import Drive
 from dxlrun_teleop.source import InputState, Press

@@ -4,6 +4,7 @@ import json
 import os
 import socket
 from functools import partial
+from pathlib import Path
 from typing import Any, cast
 
 import pytest
@@ -32,40 +33,8 @@ ACTIONS: tuple[dict[str, object], ...] = (
     {"verb": "set_parameter", "controller": "left_arm", "parameter": "p", "value": 0.2},
 )
 """A message of each action that steers."""
-WRONG: tuple[object, ...] = (
-    None,
-    "stop",
-    [],
-    {},
-    {"verb": "fly"},
-    {"verb": ["stop"]},
-    {"verb": "goal"},
-    {"verb": "goal", "joint": JOINT},
-    {"verb": "goal", "joint": JOINT, "position": "far"},
-    {"verb": "goal", "joint": JOINT, "position": True},
-    {"verb": "goal", "joint": [JOINT], "position": 0.2},
-    {"verb": "goal", "joint": "", "position": 0.2},
-    {"verb": "goal", "joint": JOINT, "position": 1e400},
-    {"verb": "torque", "joints": [], "on": True},
-    {"verb": "torque", "joints": JOINT, "on": True},
-    {"verb": "torque", "joints": [JOINT], "on": "yes"},
-    {"verb": "torque", "joints": ["no\nbody/../x"], "on": False},
-    {"verb": "switch", "controller": "", "on": True},
-    {"verb": "switch", "controller": "left_arm"},
-    {"verb": "plan", "controller": "left_arm", "position": [0.1, 0.0]},
-    {"verb": "pose", "controller": "left_arm"},
-    {"verb": "play", "motion": None},
-    {"verb": "play", "motion": "/etc/passwd"},
-    {"verb": "parameters", "controller": "../../robot"},
-    {"verb": "parameters", "controller": ""},
-    {"verb": "parameters"},
-    {"verb": "set_parameter", "controller": "left_arm"},
-    {"verb": "set_parameter", "controller": "left_arm", "parameter": "", "value": 1},
-    {"verb": "set_parameter", "controller": "left_arm", "parameter": "a.b", "value": {"deep": 1}},
-    {"verb": "set_parameter", "controller": "nobody", "parameter": "p", "value": "x" * 9000},
-    {"verb": "stop", "names": ["all"]},
-    {"verb": "halt", "on": False},
-)
+WRONG = Path(__file__).with_name("wrong_messages.jsonl").read_text().splitlines()
+LONG = {"verb": "set_parameter", "controller": "nobody", "parameter": "p", "value": "x" * 9000}
 
 
 def column(served: Served, name: str) -> Any:
@@ -121,8 +90,8 @@ def test_a_page_that_may_not_steer_only_stops(live, serve, run):
 
 def test_a_wrong_message_is_refused_with_a_sentence(live, serve):
     served = serve(live, control=True)
-    for message in WRONG:
-        status, answer = served.ask("/act", message if message is not None else "null")
+    for message in (*WRONG, json.dumps(LONG)):
+        status, answer = served.ask("/act", message.encode())
         assert status == 409, (message, answer)
         assert json.loads(answer)["refused"], message
     for raw in (b"", b"{", b"\xff\xfe", b'{"verb": "goal", "joint": "\xed\xa0\x80"}', b"[" * 60_000):

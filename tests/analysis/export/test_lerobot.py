@@ -16,8 +16,7 @@ from tests.analysis.export.conftest import NAN, ROBOTS, ROWS, Row, made
 from tests.kit.answers import result_of
 from tests.kit.campaigns import campaign
 
-from dxlrun.log.log_reader import read_log
-from dxlrun.testing import simulated_robot
+from dxlrun.testing import read_log, simulated_robot
 from dxlrun_analysis.export.episodes import Choice
 from dxlrun_analysis.export.lerobot import write_dataset
 

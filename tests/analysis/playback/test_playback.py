@@ -16,9 +16,8 @@ from tests.kit.answers import result_of
 from tests.kit.changed_logs import put, write_changed
 from tests.kit.commands import cases, play
 
-from dxlrun import ROTARY
+from dxlrun import ROTARY, InputError
 from dxlrun.description.motion import read_motion as read_motion_file
-from dxlrun.errors import InputError
 from dxlrun.log.log_reader import Log, read_log
 from dxlrun.plan.loop_plan import ControllerPlan, JointPlan
 from dxlrun.plan.robot_plan import Plan

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from functools import cache, partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +11,6 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from tests.kit.campaigns import campaign
 from tests.kit.changed_logs import flip, plan
-from tests.kit.packages import plugin_folder
 from tests.kit.stories import Asked, ask, differing, rate, replayed, send, silence, switch, tell, torque
 
 from dxlrun.channels.event_records import EventCode
@@ -30,20 +30,20 @@ joints:
   tilt: {bus: main, id: 7, model: AX-12A, reference: 150 deg, direction: -1}
   nod: {bus: main, id: 8, model: AX-12A, reference: 150 deg, direction: -1}
 controllers:
-  top: {type: law, joints: [nod, pan], into: middle, gain: 0.3, rate: 25, fallback: spare}
-  base: {type: law, joints: [pan, tilt, nod], exports: [position, velocity], drives: true}
-  beside: {type: law, joints: [tilt], into: base, gain: 0.2}
-  middle: {type: law, joints: [pan, nod], into: base, exports: [position]}
-  spare: {type: law, joints: [pan, nod], into: middle, gain: -0.1, active: false}
-  alone: {type: law, joints: [pan, tilt, nod], drives: true, active: false}
+  top: {type: ./law.py:Law, joints: [nod, pan], into: middle, gain: 0.3, rate: 25, fallback: spare}
+  base: {type: ./law.py:Law, joints: [pan, tilt, nod], exports: [position, velocity], drives: true}
+  beside: {type: ./law.py:Law, joints: [tilt], into: base, gain: 0.2}
+  middle: {type: ./law.py:Law, joints: [pan, nod], into: base, exports: [position]}
+  spare: {type: ./law.py:Law, joints: [pan, nod], into: middle, gain: -0.1, active: false}
+  alone: {type: ./law.py:Law, joints: [pan, tilt, nod], drives: true, active: false}
 """
 NAMES = ("top", "base", "beside", "middle", "spare", "alone")
-PLUGIN = '''\
+LAW = '''\
 """A law that follows its references."""
 from typing import Annotated
 
 import numpy as np
-from dxlrun import LIVE, CommandModel, Controller, Interfaces, Outcome, ParametersModel, hookimpl
+from dxlrun import LIVE, CommandModel, Controller, Interfaces, Outcome, ParametersModel
 
 
 class Move(CommandModel):
@@ -98,27 +98,13 @@ class Law(Controller[LawParameters]):
         np.copyto(commands.position, np.where(np.isnan(references.position), self.held, given))
         if self.parameters.drives:
             commands.velocity[:] = 1.0 + abs(np.nan_to_num(references.position))
-
-
-@hookimpl
-def dxlrun_contract():
-    return 1
-
-
-@hookimpl
-def dxlrun_controllers():
-    return {"law": Law}
 '''
 
 
-@pytest.fixture(scope="module")
-def law(tmp_path_factory):
-    return plugin_folder(tmp_path_factory.mktemp("law"), "law_plugin", PLUGIN, "law")
-
-
-@pytest.fixture(autouse=True)
-def _installed(law, monkeypatch):
-    monkeypatch.syspath_prepend(law)
+def write_robot(folder: Path) -> Path:
+    (folder / "law.py").write_text(LAW)
+    (folder / "chained.yaml").write_text(ROBOT)
+    return folder / "chained.yaml"
 
 
 STORIES: Mapping[str, Asked] = {
@@ -137,9 +123,8 @@ STORIES: Mapping[str, Asked] = {
 @pytest.fixture(scope="module")
 def story(tmp_path_factory):
     """Return the log of a story, which is run once."""
-    directory = tmp_path_factory.mktemp("chained")
-    (directory / "chained.yaml").write_text(ROBOT)
-    return cache(lambda name: tell(directory / "chained.yaml", STORIES[name], directory / f"{name}.mcap"))
+    robot = write_robot(tmp_path_factory.mktemp("chained"))
+    return cache(lambda name: tell(robot, STORIES[name], robot.with_name(f"{name}.mcap")))
 
 
 def active(cycles: NDArray[np.void], row: int) -> set[str]:
@@ -239,8 +224,7 @@ COMMANDS = st.one_of(
     st.dictionaries(st.integers(0, 45), st.lists(COMMANDS, min_size=1, max_size=4), max_size=12),
     st.sampled_from(((), (3,), (7,), (8,))),
 )
-def test_random_runs_of_chains(law, tmp_path, asked, silent):
-    (tmp_path / "chained.yaml").write_text(ROBOT)
+def test_random_runs_of_chains(tmp_path, asked, silent):
     ended = {**asked, 60: [ask("resume")], 120: [ask("stop")]}  # a pause has no end
     before = partial(silence, servos=silent, begin_ms=300, end_ms=700)
-    replayed(tell(tmp_path / "chained.yaml", ended, tmp_path / "run.mcap", before=before))
+    replayed(tell(write_robot(tmp_path), ended, tmp_path / "run.mcap", before=before))

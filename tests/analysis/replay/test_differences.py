@@ -17,10 +17,9 @@ from dxlrun.channels.tagged import decode
 from dxlrun.control.controllers.plugin_loading import load_plugins
 from dxlrun.description.motion import read_motion
 from dxlrun.errors import InputError
-from dxlrun.log.log_reader import read_log
 from dxlrun.remote.motion_requests import RunSnapshot, schedule_motion
 from dxlrun.remote.preparation import Preparation
-from dxlrun.testing import VirtualRobot, simulated_robot
+from dxlrun.testing import VirtualRobot, read_log, simulated_robot
 from dxlrun_analysis.replay import replay_log
 from dxlrun_controllers.motions.joint_trajectory_controller import JointTrajectoryController
 
@@ -171,9 +170,7 @@ def test_messages_from_activation_to_deactivation_are_the_same(pair_log, changed
     ("index", "at", "cycle", "field"),
     [(0, 4, -1, "header.stamp.sec"), (1, 20, 0, "number"), (30, -8, 29, "sum[1]"), (51, -16, 49, "sum[0]")],
 )
-def test_one_bit_of_one_message_is_named(  # noqa: PLR0917  fixtures, and a case
-    pair_log, changed, index, at, cycle, field
-):
+def test_one_bit_of_one_message_is_named(pair_log, changed, index, at, cycle, field):  # noqa: PLR0917
     report, first = differing(changed(pair_log, flip_message(index, at)))
     assert (report.different, report.different_messages) == (0, 1)
     assert (first.cycle, first.what) == (cycle, f"message of {STATE}: {field}")

@@ -23,8 +23,7 @@ from tests.kit.totals import totals_of
 
 from dxlrun.compile.robot_compiler import compile_files
 from dxlrun.errors import InputError, LogError
-from dxlrun.log.log_reader import read_log
-from dxlrun.testing import VirtualRobot, plan_of, simulated_robot
+from dxlrun.testing import VirtualRobot, plan_of, read_log, simulated_robot
 from dxlrun_analysis.replay import recorded_inputs, replay_log
 from dxlrun_analysis.replay.recorded_inputs import recorded
 from dxlrun_analysis.report import analyze, facts

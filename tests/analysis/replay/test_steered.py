@@ -19,9 +19,8 @@ from tests.kit.stories import tell as tell_story
 from dxlrun.channels.commands import CommandMessage
 from dxlrun.channels.event_records import EventCode
 from dxlrun.errors import LogError
-from dxlrun.log.log_reader import read_log
 from dxlrun.plan.loop_plan import ControllerPlan
-from dxlrun.testing import VirtualRobot
+from dxlrun.testing import VirtualRobot, read_log
 from dxlrun_analysis.conduct.client_commands import client_commands, policy_begun
 from dxlrun_analysis.replay import replay_log
 

@@ -12,9 +12,8 @@ from tests.kit.stories import replayed
 
 from dxlrun.cli import main
 from dxlrun.errors import LogError, PlugInError
-from dxlrun.log.log_reader import read_log
 from dxlrun.plan.recording_plan import RecordingPlan
-from dxlrun.testing import VirtualRobot, plan_of
+from dxlrun.testing import VirtualRobot, plan_of, read_log
 from dxlrun_analysis.replay import replay_log
 
 

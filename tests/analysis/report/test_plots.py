@@ -26,7 +26,6 @@ pytestmark = pytest.mark.long
 Data = NDArray[np.float64]
 COUNT, LONG = 40, 9000
 PERIOD_NS, START_NS = 20_000_000, 10**9
-BUDGET_BYTES = 16_000_000  # Of a page of any log; docs/reference/analyze.md promises it
 
 
 def filled(log: Log, count: int) -> Log:

@@ -19,11 +19,10 @@ from tests.kit.commands import Said, cases, play
 from tests.kit.held_logs import being_written, cut_end
 from tests.kit.pages import page_text
 
-from dxlrun.log.log_reader import read_log
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.schemas import LogHeader
 from dxlrun.plan.recording_plan import RecordingPlan
-from dxlrun.testing import VirtualRobot, plan_of, simulated_robot
+from dxlrun.testing import VirtualRobot, plan_of, read_log, simulated_robot
 from dxlrun_analysis.latency import latency_log
 from dxlrun_analysis.report import analyze_log
 from dxlrun_analysis.season import season_runs
@@ -179,9 +178,7 @@ def test_a_table_that_is_damaged_or_of_other_code_is_made_anew(season, here, dxl
         ("cycles = (SELECT max(cycles) FROM logs)", "log", ["may/third.mcap"]),
     ],
 )
-def test_conditions_choose_logs(  # noqa: PLR0917  fixtures, and a case
-    made, here, dxlrun, where, sort, expected
-):
+def test_conditions_choose_logs(made, here, dxlrun, where, sort, expected):  # noqa: PLR0917
     assert list(rows(dxlrun("logs", made, "--json", "--where", where, "--sort", sort))) == expected
 
 
@@ -222,9 +219,7 @@ def test_refused(made, tmp_path, monkeypatch, dxlrun, case):
         ("no cache", "set XDG_CACHE_HOME to another directory"),
     ],
 )
-def test_what_cannot_be_is_one_sentence(  # noqa: PLR0917  fixtures
-    season, here, dxlrun, monkeypatch, kind, sentence
-):
+def test_what_cannot_be_is_one_sentence(season, here, dxlrun, monkeypatch, kind, sentence):  # noqa: PLR0917
     if kind == "no duckdb":
         monkeypatch.setattr("dxlrun.errors.find_spec", lambda name: None)
     if kind == "no cache":

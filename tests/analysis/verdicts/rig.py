@@ -19,10 +19,8 @@ from tests.kit.bus_ports import BusPorts
 from tests.kit.line_faults import change_replies, watch_instructions
 
 from dxlrun.channels.commands import CommandMessage, QueueInbox
-from dxlrun.log.log_reader import Log, read_log
 from dxlrun.run import virtual_run
-from dxlrun.run.virtual_run import VirtualRobot
-from dxlrun.testing import simulated_robot
+from dxlrun.testing import Log, VirtualRobot, read_log, simulated_robot
 from dxlsim.bus.simulated_bus import DisturbedReply, PacketFault, SimulatedBus
 from dxlsim.faults.fault import parse_fault
 from dxlsim.faults.script import FaultScript

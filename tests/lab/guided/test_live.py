@@ -21,9 +21,8 @@ from tests.kit.live_run import LiveRuns
 import dxlrun
 from dxlrun.cli import main
 from dxlrun.errors import DxlrunError, InputError
-from dxlrun.log.log_reader import read_log
 from dxlrun.remote.sockets import sockets
-from dxlrun.testing import VirtualRobot, plan_of
+from dxlrun.testing import VirtualRobot, plan_of, read_log
 from dxlrun_lab.commands import on_robot
 from dxlrun_lab.commands.on_robot import AbortMonitor, ExperimentOptions, run_on_robot
 from dxlrun_lab.guided.choice import situation_of

@@ -8,17 +8,15 @@ import pytest
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from dxlrun.log.log_reader import Log, read_log
 from dxlrun.plan.loop_plan import ScheduledCommand
-from dxlrun.run.virtual_run import VirtualRobot
-from dxlrun.testing import plan_of
+from dxlrun.testing import Log, VirtualRobot, plan_of, read_log
 from dxlrun_lab.identify.excitation import Room, excitation
 from dxlrun_lab.identify.fit import fit_run
 from dxlrun_lab.identify.joint_recording import measured
 from dxlrun_lab.identify.known_servo import Servo, servos_in
 from dxlrun_lab.identify.result import IdentifiedServo, KnownLoad, identified
 
-GRAVITY, INERTIA, ANGLE_DEG = 0.3, 0.005, 20.0
+GRAVITY, INERTIA = 0.3, 0.005
 """Of the load that the simulated servos move"""
 ROBOT = """name: one
 buses: {{main: {{port: sim, protocol: {protocol}, baud_rate: 1_000_000, return_delay_time: 0 us}}}}

@@ -10,9 +10,8 @@ from pathlib import Path
 import pytest
 
 from dxlrun.compile.robot_compiler import compile_files
-from dxlrun.log.log_reader import Log, read_log
 from dxlrun.plan.robot_plan import Plan
-from dxlrun.testing import VirtualRobot
+from dxlrun.testing import Log, VirtualRobot, read_log
 from dxlrun_lab.tracking.desired_motion import DesiredMotion, desired_motion
 from dxlrun_lab.tracking.motion_evaluation import SetupResult, measure_tracking
 from dxlrun_lab.tracking.setups import Setup, chosen

@@ -10,9 +10,8 @@ import pytest
 from msgspec.structs import replace
 from tests.kit.stages import Stage
 
-from dxlrun import MotorLoad, MotorModel
+from dxlrun import InputError, MotorLoad, MotorModel
 from dxlrun.compile.robot_compiler import compile_files
-from dxlrun.errors import InputError
 from dxlrun_controllers.feed_forward import FeedForward
 from dxlrun_controllers.gravity_compensation import GravityCompensation
 from dxlrun_controllers.laws.gravity import GRAVITY, gravity_law, up_of

@@ -31,14 +31,6 @@ def base(parameters=BASE, **options):
     return standing(DiffDriveController, parameters, **options).activate()
 
 
-def driving(parameters=BASE, linear=0.0, angular=0.0, **options):
-    """Return a base that was commanded a twist, after a cycle."""
-    robot = base(parameters, **options)
-    robot.give("velocity", linear=linear, angular=angular)
-    robot.step()
-    return robot
-
-
 def on_arc(way, angle):
     """Closed form: a point that moves `way` along a circle and turns by `angle`, from the origin along x."""
     if abs(angle) < 1e-12:
