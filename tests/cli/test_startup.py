@@ -8,7 +8,6 @@ import sys
 from pathlib import Path
 
 import pytest
-from tests.kit.awaited import DEADLINE_S
 
 import dxlrun
 
@@ -170,9 +169,6 @@ def test_every_name_is_there():
 
 
 @pytest.mark.parametrize("module", ["dxlrun", "dxlrun.control.realtime_grants"])
-def test_importing_it_loads_neither_numpy_nor_pydantic(module):
-    script = f"import sys, {module}; print([m for m in ('numpy', 'pydantic', 'pluggy') if m in sys.modules])"
-    done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=True, timeout=DEADLINE_S
-    )
-    assert done.stdout.strip() == "[]"
+def test_importing_it_loads_neither_numpy_nor_pydantic(module: str) -> None:
+    imported = set(printed(f"import json, sys, {module}; print(json.dumps([*sys.modules]))"))
+    assert beneath(imported, "numpy", "pydantic", "pluggy") == set()

@@ -1,7 +1,6 @@
 """Whole runs: one that is steered from Python until it is told to stop, and one whose gateway dies."""
 
 import json
-import math
 import os
 import signal
 import socket
@@ -87,17 +86,10 @@ def misbehave(path: Path) -> None:
 def steered(tmp_path_factory, runs, place):
     """A run that was steered with everything there is, and stopped by its client."""
     run = Run(runs, tmp_path_factory.mktemp("steered"))
-    robot, run.refused = run.robot, []
-
-    def refused(ask, *words):
-        with pytest.raises(dxlrun.Refused) as caught:
-            ask(*words)
-        run.refused.append((str(caught.value), caught.value.exit_code))
-
+    robot = run.robot
     robot.send("hold", "positions", {"positions": np.array([0.1, 0.1])})
-    refused(robot.send, "hold", "positions", {"positions": [0.1]})
-    refused(robot.send, "hold", "positions", {"positions": [math.radians(9999), 0.1]})
-    refused(robot.switch, ["solo"])
+    with pytest.raises(dxlrun.Refused, match="pan"):
+        robot.switch(["solo"])
     robot.switch(activate=["solo"], deactivate=["hold"])
     with robot.stream("solo", "positions", lease=0.1) as stream:
         assert stream.send({"positions": [1e9]}) == 1
@@ -107,7 +99,6 @@ def steered(tmp_path_factory, runs, place):
     until(lambda: robot.info()["controllers"][1]["held"], "the end of the stream's lease")
     misbehave(place / "pair.sock")
     robot.rate(100.0)
-    refused(robot.load, "more", {"type": "joint_group_position_controller", "joints": ["tilt"]})
     robot.pause()
     robot.load("more", {"type": "joint_group_position_controller", "joints": ["tilt"], "rate": 50})
     robot.resume()
@@ -137,7 +128,6 @@ def test_the_log_has_every_command_and_its_client(steered):
         ("", "switch"),
         ("", "switch"),
         ("", "rate"),
-        ("", "load"),
         ("", "pause"),
         ("", "load"),
         ("", "resume"),
@@ -150,15 +140,6 @@ def test_the_log_has_every_command_and_its_client(steered):
     assert 1 <= len(streamed) <= 6
     assert {(one.controller, one.lease_ns) for one in streamed} == {("solo", 100_000_000)}
     assert np.frombuffer(streamed[-1].data) == pytest.approx([0.04])  # the newest of them always arrives
-
-
-def test_refusals_have_their_reason_and_whether_the_request_itself_was_wrong(steered):
-    assert [code for _, code in steered.refused] == [2, 2, 1, 1]
-    sentences = " / ".join(sentence for sentence, _ in steered.refused)
-    assert "hold" in sentences
-    assert "pan" in sentences
-    assert "pan is sent to 9999 deg, outside its limits -150..+150 deg" in sentences
-    assert "the loop is not paused; pause it first" in sentences
 
 
 def test_clients_can_read_what_became_of_their_commands(steered):
