@@ -296,8 +296,6 @@ class CartesianController(Controller[CartesianParameters]):
     def on_goal(self, goal: Goal, data: NDArray[np.float64], time_ns: int) -> None:
         """Plan a motion to the pose; a motion that is under way brakes first."""
         self._goal, self._is_cancelled, self._feedback_ns = goal, False, time_ns + FEEDBACK_NS
-        if not self._at:
-            self._hold_joints()
         if self._at:
             self._pass_to(unpacked(data, POSES))
         else:
@@ -310,7 +308,7 @@ class CartesianController(Controller[CartesianParameters]):
             if self._at:
                 self._follow(unpacked(data, TWISTS), time_ns)
         elif self._moves or self._goal is not None:
-            self._publish(NoPath("the arm moves; ask again when it rests"))
+            self._publish("the arm moves; ask again when it rests")
         else:
             self._task = self._try(unpacked(data, POSES))
 
@@ -350,7 +348,7 @@ class CartesianController(Controller[CartesianParameters]):
         if self._is_cancelled:
             self._is_cancelled = False
             self._end(Outcome.CANCELLED)
-        elif self._waiting is not None:
+        if self._waiting is not None:
             self._task, self._waiting = self._pursue(self._waiting), None
         elif any(map(any, self._twist)):
             self._task, self._moves = self._stream_twists(), True
@@ -443,16 +441,15 @@ class CartesianController(Controller[CartesianParameters]):
     def _try(self, asked: PoseGoal) -> Task:
         """Plan a motion from rest to a pose, and publish it."""
         found = yield from self._planned(asked)
-        self._publish(found, "" if isinstance(found, NoPath) else _remark(found, asked))
-
-    def _publish(self, found: Path | NoPath, text: str = "") -> None:
-        x, y, z = (self._target or BASE)[1]
-        last, seconds = (math.nan,) * len(self.context.joints), math.nan
         if isinstance(found, NoPath):
-            text = found.text
+            self._publish(found.text)
         else:
-            last, seconds = found.last, found.duration_s
-        self.context.publish("plan", PosePlan(x, y, z, np.array(last), seconds, text))
+            self._publish(_remark(found, asked), found.last, found.duration_s)
+
+    def _publish(self, text: str, positions: Positions = (), seconds: float = math.nan) -> None:
+        x, y, z = (self._target or BASE)[1]
+        last = np.array(positions or (math.nan,) * len(self.context.joints))
+        self.context.publish("plan", PosePlan(x, y, z, last, seconds, text))
 
     def _pursue(self, asked: PoseGoal) -> Task:
         """Plan a motion to a pose, make it, and let the runtime judge the goal at the end of the path.

@@ -86,7 +86,7 @@ class PoseCommand(CommandModel):
         given = any(each is not None for each in (self.x, self.y, self.z, self.dx, self.dy, self.dz, *turns))
         if self.pose is not None:
             if given or self.frame or "path" in self.model_fields_set:
-                raise ValueError("give the name of a pose, or its coordinates")
+                raise ValueError("a pose by name has no other coordinates, frame or path; remove them")
             return self
         if sum(each is not None for each in turns) > 1:
             raise ValueError("give only one of rpy, drpy and quaternion")

@@ -358,6 +358,12 @@ def test_a_pose_follows_a_twist_and_a_twist_ends_a_pose() -> None:
     rows += [*streamed(stage, 0.5, vx=0.05)]
     assert stage.goal.ended[0][:2] == ("preempted", "replaced by a twist")
     rows += [*played(stage, 1.0)]
+    stage.send(None, "pose", dz=0.05)
+    rows += [*played(stage, 0.4)]
+    stage.cancel()
+    stage.give("twist", vx=-0.05)
+    rows += [*played(stage, 1.0)]
+    assert tip(stage)[0, 3] < all_arms()["open_manipulator_x"].matrix(rows[-51])[0, 3] - 1e-3
     assert_smooth(np.array(rows))
 
 
