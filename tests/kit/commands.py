@@ -1,6 +1,7 @@
 """Commands run in this process, and texts of what they print.
 
-A text in `tests/cli` has files behind lines `---- NAME` up to `====`, and then cases:
+A text of `tests/cli`, or a `refusals.txt` next to tests, has files behind lines `---- NAME` up to `====`,
+and then cases:
 
     check arm.yaml --online => 1
       > arm: good. ... 2 warnings
