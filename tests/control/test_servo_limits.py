@@ -15,7 +15,7 @@ from dxlrun.channels.cycle import Clamp
 from dxlrun.channels.event_records import EventCode, Severity
 from dxlrun.errors import StartUpError
 from dxlrun.plan.loop_plan import JointPlan, ServoLimit
-from dxlrun.testing import VirtualRobot
+from dxlrun.testing import VirtualRobot, simulated_robot
 from dxlwire.control_table import find_table
 from dxlwire.modes import Mode
 
@@ -211,52 +211,16 @@ def test_limits_are_read_again_when_another_servo_took_the_place_of_a_lost_one(
     assert all(text in event for text, event in zip(reversed(texts), reversed(told), strict=False))
 
 
-def slow_robot(tmp_path: Path, raw: int) -> Path:
-    """Start a P servo, which refuses a Profile Velocity beyond its Velocity Limit, and move it."""
+def test_a_velocity_limit_with_which_no_goal_is_taken_is_named_with_what_helps(tmp_path):
     file = tmp_path / "robot.yaml"
     limits = "limits: {position: [-10 deg, 10 deg], velocity: 1.5 rad/s}"
     file.write_text(
         ROBOT.format(model="PM42-010-S260", protocol=2.0, kind="position", reference=0, limits=limits)
     )
-    story = {20: [send("c", "positions", 0.1)]}
-    return tell(
-        file,
-        story,
-        tmp_path / "run.mcap",
-        seconds=2.0,
-        before=lambda robot: robot.buses[0].servo(1).poke("velocity_limit", raw),
-    )
-
-
-@pytest.mark.parametrize("raw", [470, 120])
-def test_a_velocity_limit_below_the_first_speed_is_reported_and_no_refusal(raw, tmp_path):
-    """The start holds a servo with a goal whose speed is 0.5 rad/s, 477 ticks, at most."""
-    log = replayed(slow_robot(tmp_path, raw))
-    (text,) = (event.text for event in log.events if event.code == EventCode.SERVO_LIMITS)
-    assert f"goals of velocity are held to Velocity Limit (44) = {raw}, " in text
-    assert log.cycles["position"][-1, 0] == pytest.approx(0.1, abs=0.01)
-
-
-def test_a_velocity_limit_with_which_no_goal_is_taken_is_named_with_what_helps(tmp_path):
+    robot = simulated_robot(file)
+    robot.buses[0].servo(1).poke("velocity_limit", 0)
     with pytest.raises(StartUpError, match=r"raise its Velocity Limit \(44\) from 0 to 1 or more\n"):
-        slow_robot(tmp_path, 0)
-    slow_robot(tmp_path, 1)
-
-
-def test_a_servo_that_returns_with_the_same_limits_is_no_second_event(tmp_path):
-    file = tmp_path / "robot.yaml"
-    limits = "limits: {position: [-90 deg, 90 deg]}"
-    file.write_text(
-        ROBOT.format(model="XM430-W350", protocol=2.0, kind="velocity", reference=180, limits=limits)
-    )
-
-    def lose(robot: VirtualRobot) -> None:
-        robot.buses[0].servo(1).poke("velocity_limit", 50)
-        silence(robot, [1], 300, 900)
-
-    log = replayed(tell(file, {}, tmp_path / "run.mcap", seconds=2.5, before=lose))
-    assert any(event.code == EventCode.SERVO_BACK for event in log.events)
-    assert len([event for event in log.events if event.code == EventCode.SERVO_LIMITS]) == 1
+        robot.run()
 
 
 def test_a_register_binds_the_steps_only_where_the_file_limits_the_speed():
