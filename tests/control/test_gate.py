@@ -365,6 +365,11 @@ def test_a_joint_that_hangs_outside_its_limits_goes_back_slowly_and_never_furthe
     assert goals[-1] == pytest.approx(-0.9)
 
 
+@SIDES
+def test_a_joint_at_its_limit_has_the_speed_that_is_commanded(side):
+    assert GateRig().apply(position=side, velocity=3.0)[:2] == (side, 3.0)
+
+
 # Slow starts
 
 
