@@ -229,13 +229,6 @@ class Robot:
                     bus.store_state(index, bytes(reply), self.now_ns - age_ns)
         self.samples.fill_states(self.now_ns)
 
-    def all_said(self, *raw, age_ns=0):
-        """Let every servo say the same."""
-        for index in range(len(self.servos)):
-            self.put(index, *raw)
-        count = len(self.servos)
-        self.settle([True] * count, [age_ns] * count)
-
     def turn(self, *positions, after_ms=10, came=True):
         """Let the servos stand at angles, rad; return which are valid, and where."""
         for index, (servo, angle) in enumerate(zip(self.servos, positions, strict=True)):
@@ -244,36 +237,6 @@ class Robot:
         fresh = [True] * (len(positions) - 1) + [came]
         self.settle(fresh, [0] * len(positions), after_ns=after_ms * MS)
         return self.states.valid.tolist(), self.states.position.tolist()
-
-
-def test_signs_follow_the_joints_direction():
-    robot = Robot(make_plan())
-    robot.all_said(512, 100, 1024 + 200, age_ns=30)  # counter-clockwise 100; clockwise 200
-    servo = robot.servos[0]
-    direction = np.array([one.direction for one in robot.servos])
-    assert robot.states.position == pytest.approx([one.joint_position(512) for one in robot.servos])
-    assert robot.states.velocity == pytest.approx(direction * 100 * servo.rad_s_per_tick)
-    assert robot.states.effort == pytest.approx(direction * -200 / 1023)
-    assert robot.states.age_ns.tolist() == [30] * 8
-
-
-def test_a_lost_row_keeps_its_own_values_and_ages():
-    robot = Robot(make_plan())
-    states = robot.states
-    for index in range(8):
-        robot.put(index, 100 + index, 0, 0)
-    robot.settle(np.arange(8) != 3, [0] * 8)
-    assert np.isnan(states.position[3])
-    assert states.age_ns[3] == -1
-    robot.settle([True] * 8, [0] * 8)
-    kept = states.position.copy()
-    for index in range(8):
-        robot.put(index, 90, 0, 0)
-    robot.settle(np.arange(8) != 5, [0] * 8)
-    assert states.position[5] == kept[5]
-    assert not states.valid[5]
-    assert states.age_ns[5] == 10 * MS
-    assert (states.position != kept).sum() == 7
 
 
 class TestJumps:

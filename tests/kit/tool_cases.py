@@ -1,6 +1,7 @@
-"""Cases of `dxlrun servo` as text, in `tests/dynamixel/tool_cases`; see `servo_cases.py` for the form.
+"""Cases of `dxlrun servo` and `dxlrun scan` as text, in `tests/dynamixel/tool_cases`; see `servo_cases.py`.
 
-A case begins with `tool:`. What a step did has a line `=> done: ...`, or `=> refused: ...` if it was refused.
+A case begins with `tool:` or `line:`. What a step did or found has a line `=> done: ...`, and what was
+refused `=> refused: ...`.
 """
 
 from __future__ import annotations
@@ -8,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import partial
+from typing import Any
 
 import pytest
 from tests.kit.rigs import VirtualLine
@@ -15,11 +17,11 @@ from tests.kit.servo_cases import Case, do_one
 
 from dxlrun.cli.tools.servo import VERBS, VerbCall
 from dxlrun.dynamixel.tools.one_servo import OneServo
-from dxlrun.dynamixel.tools.scanning import Search, find_servo
+from dxlrun.dynamixel.tools.scanning import FoundServo, Search, find_servo, scan
 from dxlrun.dynamixel.tools.tool_line import ToolLine
 from dxlrun.errors import DxlrunError
 from dxlsim.servo.simulated_servo import SimulatedServo
-from dxlsim.simulation_plan import ServoConfig
+from dxlsim.simulation_plan import AdapterConfig, ServoConfig
 from dxlwire.wire.protocol2 import Reset
 
 RATE = 57_600
@@ -58,6 +60,13 @@ class ToolRig:
         return [data[7] if data[2] == 0xFD else data[4] for data in self.line.heard[self.start :]]
 
 
+class ScanRig(ToolRig):
+    """Servos on a line on which somebody looks for them."""
+
+    def __init__(self, line: VirtualLine) -> None:
+        self.line, self.clock, self.buses, self.start = line, line.clock, [line.bus], 0
+
+
 @dataclass
 class ToolCase(Case):
     """A case of the tool."""
@@ -92,6 +101,30 @@ class ToolCase(Case):
         more = {given[kind]: [int(one) for one in (numbers or "").split()]} if kind else {}
         self.do(lambda: setattr(self, "tool", ToolRig(model, **more)))
 
+    def open_line(self, servos: str, rate: str, kind: str | None, value: str | None) -> None:
+        listed = [(model, each) for model, *ids in map(str.split, servos.split(", ")) for each in ids]
+        configs = [ServoConfig(int(each), model, 2.0) for model, each in listed]
+        more: dict[str, Any] = {"protocol": 1.0 if servos[:2] in {"AX", "MX"} else 2.0, "rate": int(rate)}
+        if kind == "without":
+            more["cannot"] = tuple(map(int, (value or "").split()))
+        elif kind:
+            timer_ns = round(float(value or 0) * 1e6)
+            more["adapter"] = AdapterConfig(latency_timer_ns=timer_ns, echo=kind == "that echoes")
+        self.tool = ScanRig(VirtualLine(*configs, **more))
+
+    def scan(self, ids: str | None, everywhere: str | None) -> None:
+        """Look for servos at the rate that the line has, or at all rates of its protocol."""
+        bus = self.tool.line.bus
+        rates = () if everywhere else (bus.baud_rate,)
+        search = Search((bus.protocol,), rates, tuple(map(int, (ids or "").split())))
+
+        def look() -> list[str]:
+            result = scan(ToolLine(self.tool.line), search)
+            left_out = [f"no rate of the adapter: {rate}" for rate in result.left_out]
+            return [*map(described, result.servos), *left_out]
+
+        self.do(look)
+
     def write(self, registers: str) -> None:
         wanted = [one.split() for one in registers.split(", ")]
         one = self.tool.one
@@ -115,8 +148,20 @@ class ToolCase(Case):
         assert servo.torque_on == (torque == "with")
 
 
+def described(found: FoundServo) -> str:
+    """Return what a scan found."""
+    where = f"ID {found.servo_id} at {found.baud_rate} bit/s"
+    return "; ".join((f"{where}: {found.model or 'unknown'}", *found.remarks))
+
+
 STEPS: dict[str, Callable[..., object]] = {
     r"tool: (\S+)(?:, (others|adapter without) (.+))?": ToolCase.open_tool,
+    r"line: (.+?) at (\d+)(?:, adapter (without|that echoes|of)(?: ([\d ]+?)(?: ms)?)?)?": ToolCase.open_line,
+    r"line unplugged": lambda case: case.tool.line.ports.ports[0].unplug(),
+    r"scan(?: ([\d ]+))?( at all rates)?": ToolCase.scan,
+    r"find (\d+) everywhere": lambda case, servo_id: case.do(
+        lambda: map(described, find_servo(ToolLine(case.tool.line), int(servo_id)))
+    ),
     r"servo (\d+): (.+)": Case.change_servo,
     r"instruction (\d+) lost": ToolCase.lose_instruction,
     r"(\d+) s": lambda case, time: case.tool.wait(float(time)),
