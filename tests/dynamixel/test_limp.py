@@ -129,44 +129,6 @@ def wheels(model="XM430-W350", protocol=2.0, *, ids=(1, 2), velocity=1.0):
     return rig
 
 
-@pytest.mark.parametrize(("model", "protocol"), [("MX-28", 1.0), ("AX-12A", 1.0), ("XL430-W250", 2.0)])
-def test_wheels_of_a_robot_that_is_left_with_torque_by_a_loop_that_died_stand(model, protocol):
-    rig = wheels(model, protocol)
-    rig.servo(2).poke("torque_enable", 0)
-    rig.hardware.read_states()  # and the loop dies
-    assert stand(rig.lines) == ("main_1_joint (ID 1 on bus main) was stopped: its goal is 0",)
-    rig.wait(500_000_000)
-    assert rig.torque() == [True, False], "a servo without torque was given some"
-    standing = rig.servo(1).shaft_angle
-    rig.wait(500_000_000)
-    assert rig.servo(1).shaft_angle == pytest.approx(standing, abs=0.05)
-
-
-@pytest.mark.parametrize("lost", [False, True])
-def test_a_wheel_that_takes_no_goal_any_more_loses_its_torque(lost):
-    """Torque off is tried again where its instruction is lost."""
-    rig, left = wheels(), [lost]
-    rig.servo(1).poke("bus_watchdog", -1)
-    rig.when(
-        lambda data: data[4] == 1 and data[7:11] == b"\x03\x40\x00\x00" and left.pop() if left else False,
-        partial(rig.buses[0].alter_next_instruction, "lost", lambda _: b""),
-    )
-    said = [text for text in stand(rig.lines) if text.startswith("main_1_joint (ID 1 on bus main) could not")]
-    assert "be stopped and is limp: " in said[-1]
-    assert lost or "did not acknowledge its goal" in said[0]
-    assert not left
-    assert rig.torque() == [False, True]
-
-
-def test_a_wheel_that_keeps_its_torque_whatever_is_written_is_named():
-    rig = wheels()
-    rig.servo(1).poke("bus_watchdog", -1)
-    rig.stick(1, "torque_enable", 1)
-    (said, _) = stand(rig.lines)[::-1]
-    assert said.startswith("main_1_joint (ID 1 on bus main) may keep moving: ")
-    assert said.endswith("torque off was not confirmed")
-
-
 def test_a_wheel_stands_before_silent_ones_are_awaited_for_long():
     rig = wheels("AX-12A", 1.0, ids=(1, 2, 3, 4))
     rig.goals.velocity[:] = 1.0

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 from tests.kit.campaigns import campaign
-from tests.kit.line_faults import truncate_next, turn_by_hand
+from tests.kit.line_faults import truncate_next
 from tests.kit.rigs import every_servo, make_plan, make_rig, random_fault, start_rig
 
 from dxlrun.channels.event_records import EventCode
@@ -197,58 +197,6 @@ def test_a_wheel_of_a_model_that_controls_no_speed_reports_its_speed_in_the_same
     command(rig, V, 3.0)
     assert moved(rig, 50) / (50 * 0.02) == pytest.approx(3.0, rel=0.1)
     assert rig.states.velocity[0] == pytest.approx(3.0, rel=0.05)
-
-
-def make_wheel(model="XM430-W350", protocol=2.0, **more):
-    """Two continuous joints that get torque again when they return, of which the first is tested."""
-    plan = make_plan(
-        (1, 2), model=model, protocol=protocol, reference=math.pi, return_delay_ns=0, **ENDLESS, **more
-    )
-    return start_rig(every_servo(plan, torque_on_return=True))
-
-
-def test_a_joint_that_forgot_its_turns_over_a_reboot_does_not_wind_them_up_again():
-    rig = make_wheel(start_mode=P)
-    for _ in range(300):
-        rig.goals.position[0] += 0.04
-        rig.cycle()
-    servo = rig.servo(1)
-    servo.cut_power(rig.clock.now_ns() + 300_000_000)
-    standing = servo.shaft_angle
-    rig.cycles(150)
-    assert rig.states.valid[0]
-    assert servo.shaft_angle == pytest.approx(standing, abs=0.1)
-    assert rig.torque() == [False, True]
-    (text,) = rig.events.texts(EventCode.SERVO_LIMP)
-    assert "lost its turn count" in text
-    assert "switch its torque on with `dxlrun torque on main_1_joint`" in text
-    assert rig.events.of(EventCode.IMPLAUSIBLE) == [], "its position is another one for a known reason"
-    rig.hardware.switch_torque(0, True)
-    rig.cycles(20)
-    assert rig.torque() == [True, True]
-    assert servo.shaft_angle == pytest.approx(standing, abs=0.1)
-
-
-def test_a_wheel_that_made_more_turns_than_its_servo_counts_does_not_wind_them_back():
-    rig = make_wheel("MX-28", 1.0)
-    servo = rig.servo(1)
-    turn_by_hand(servo, 7.8 * math.tau)
-    standing = servo.shaft_angle
-    rig.set_modes(P, 0)
-    rig.cycles(60)
-    assert servo.shaft_angle == pytest.approx(standing, abs=0.1)
-    ((source, text),) = rig.events.of(EventCode.MODE)[-1:]
-    assert (source, "outside its limits" in text) == ("main_1_joint", True)
-
-
-def test_a_wheel_that_coasted_a_little_over_its_last_turn_is_led_back_and_keeps_its_torque():
-    rig = make_wheel("MX-28", 1.0)
-    plan = rig.plans[0].servos[0]
-    upper = plan.mode_plan(P).upper_tick
-    turn_by_hand(rig.servo(1), (upper + 100) * plan.rad_per_tick)
-    change(rig, P)
-    assert rig.torque() == [True, True]
-    assert rig.servo(1).registers["goal_position"] == upper
 
 
 def test_a_servo_that_lost_its_torque_over_a_change_gets_no_goal_which_would_switch_it_on(ax):

@@ -277,6 +277,10 @@ class Case:
         joint = servo.direction * (angle + off - raw) * servo.ratio
         assert self.rig.states.position[servo.row] == pytest.approx(joint, abs=tick), math.degrees(joint)
 
+    def expect_turning(self, servo_id: str, turns: str) -> None:
+        velocity = self.rig.servo(int(servo_id)).velocity
+        assert (abs(velocity) > 0.05) == (turns == "turns"), f"it turns by {velocity:.2f} rad/s"
+
     def expect_ids(self, found: Sequence[int], ids: str) -> None:
         named = {"all": self.ids, "none": []}
         expected = named[ids] if ids in named else [int(one) for one in ids.split()]
@@ -413,4 +417,5 @@ EXPECTATIONS: dict[str, Callable[..., object]] = {
     ),
     r"mode (\d+): (\w+)": Case.expect_mode,
     r"(\d+) is at (\S+) deg": Case.expect_place,
+    r"(\d+) (stands|turns)": Case.expect_turning,
 }
