@@ -168,11 +168,11 @@ def test_a_reply_that_was_long_under_way_is_no_reboot():
     assert tick(1_000, 1_000_000_000, 1_150_000_000).rebooted(tick(0, 0)) is False
 
 
-def start_slow(plan=None, *, slow_period_ns=1_000_000_000, items=(), returning=False):
+def start_slow(plan=None, *, slow_period_ns=1_000_000_000):
     plan = plan or make_x((11, 12))
-    slow = items or slow_items(find_table(plan.servos[0].model, plan.protocol))
+    slow = slow_items(find_table(plan.servos[0].model, plan.protocol))
     plan = replace(plan, slow_period_ns=slow_period_ns)
-    return start_rig(every_servo(plan, slow=slow, torque_on_return=returning))
+    return start_rig(every_servo(plan, slow=slow))
 
 
 @pytest.mark.parametrize(
@@ -217,59 +217,6 @@ def test_slow_registers_make_no_cycle_late_and_wait_for_ever_where_there_is_no_t
     rig.period_ns = 2_000_000
     rig.cycles(200)
     assert np.isfinite(rig.states.voltage).all()
-
-
-def test_a_hot_servo_is_reported_ten_degrees_before_its_limit_and_when_it_has_cooled():
-    rig = start_slow()
-    servo = rig.servo(12)
-    limit = servo.registers["temperature_limit"]
-    for temperature, events in (
-        (30, 0),
-        (limit - 8, 1),
-        (limit - 12, 1),
-        (40, 2),
-    ):  # at 12 it is not cooled yet
-        servo.temperature = temperature
-        rig.cycles(70)
-        assert len(rig.events.of(EventCode.SERVO_HOT)) == events
-    assert rig.events.sources(EventCode.SERVO_HOT) == ["arm_12_joint"] * 2
-    assert "above 80 deg C (Temperature Limit (31))" in rig.events.texts(EventCode.SERVO_HOT)[0]
-
-
-def test_another_item_is_reported_when_it_changes():
-    rig = start_slow(items=("position_p_gain",))
-    rig.cycles(120)
-    rig.servo(12).poke("position_p_gain", 640)
-    rig.cycles(60)
-    ((source, text),) = rig.events.of(EventCode.REGISTER_DIFFERS)
-    assert source == "arm_12_joint"
-    assert "Position P Gain (84) changed from 800 to 640" in text
-
-
-@pytest.mark.parametrize("returning", [False, True])
-def test_a_reboot_that_no_read_missed_is_seen_by_the_tick(returning):
-    rig = start_slow(returning=returning)
-    rig.period_ns = 250_000_000  # it boots between two reads
-    rig.cycles(12)
-    rig.servo(12).boot_ns = 0
-    rig.servo(12).power_cycle()
-    rig.cycles(12)
-    assert rig.events.sources(EventCode.SERVO_REBOOTED) == ["arm_12_joint"]
-    assert rig.events.of(EventCode.READ_LOST) == []
-    assert rig.torque() == [True, returning]
-    assert rig.states.valid.all()
-    rig.goals.position[:] += 0.05
-    rig.cycles(2)
-    assert (12 in rig.goals_sent()[-1][1]) == returning
-
-
-def test_a_hardware_error_is_in_the_states_as_long_as_it_stands():
-    rig = start_slow()
-    rig.cycles(5)
-    for error, cycles in ((0x20, 5), (0x24, 55)):  # the alert stands as before
-        rig.servo(12).poke("hardware_error_status", error)
-        rig.cycles(cycles)
-        assert rig.states.hardware_error.tolist() == [0, error]
 
 
 TRIPPED = 0xFF

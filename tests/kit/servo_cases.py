@@ -46,6 +46,7 @@ from dxlsim.simulation_plan import ServoConfig
 from dxlwire.bus_plan import BusPlan, RegisterValue
 from dxlwire.control_table import find_table
 from dxlwire.modes import Mode
+from dxlwire.plan.reads import slow_items
 
 CASES = Path(__file__).parents[1] / "dynamixel" / "cases"
 HELP = help_link("")
@@ -172,14 +173,8 @@ class Case:
         later: list[Callable[[BusPlan], BusPlan]] = []
         for option in (options or "").split(", "):
             name, _, value = option.rpartition(" ")
-            if name == "watchdog":
-                later.append(partial(replace, watchdog_ticks=int(value)))
-            elif name == "port":
-                later.append(partial(replace, port=value))
-            elif option == "torque on return":
-                later.append(partial(every_servo, torque_on_return=True))
-            elif name == "limp":
-                later.append(partial(limp_at_start, int(value)))
+            if name in CHANGED_PLANS:
+                later.append(CHANGED_PLANS[name](value))
             elif option == "taken over":
                 self.options["take_over"] = True
             elif name in {"firmware", "position"}:
@@ -277,6 +272,10 @@ class Case:
         joint = servo.direction * (angle + off - raw) * servo.ratio
         assert self.rig.states.position[servo.row] == pytest.approx(joint, abs=tick), math.degrees(joint)
 
+    def expect_error(self, servo_id: str, error: str) -> None:
+        found = self.rig.states.hardware_error[self.row(servo_id)]
+        assert found == int(error), f"it is {found}"
+
     def expect_turning(self, servo_id: str, turns: str) -> None:
         velocity = self.rig.servo(int(servo_id)).velocity
         assert (abs(velocity) > 0.05) == (turns == "turns"), f"it turns by {velocity:.2f} rad/s"
@@ -314,6 +313,22 @@ def limp_at_start(servo_id: int, plan: BusPlan) -> BusPlan:
         replace(one, torque_at_start=one.torque_at_start and one.servo_id != servo_id) for one in plan.servos
     ]
     return replace(plan, servos=tuple(servos))
+
+
+def read_slowly(item: str, plan: BusPlan) -> BusPlan:
+    """Return a plan that reads an item, or `all` that is measured, once a second in idle time."""
+    table = find_table(plan.servos[0].model, plan.protocol)
+    slow = slow_items(table) if item == "all" else (item,)
+    return every_servo(replace(plan, slow_period_ns=1_000_000_000), slow=slow)
+
+
+CHANGED_PLANS: dict[str, Callable[[str], Callable[[BusPlan], BusPlan]]] = {
+    "watchdog": lambda ticks: partial(replace, watchdog_ticks=int(ticks)),
+    "port": lambda port: partial(replace, port=port),
+    "torque on": lambda _: partial(every_servo, torque_on_return=True),  # `torque on return`
+    "slow": lambda item: partial(read_slowly, item),
+    "limp": lambda servo_id: partial(limp_at_start, int(servo_id)),
+}
 
 
 def turn_beyond(case: Case, servo: SimulatedServo, ticks: str, side: str) -> None:
@@ -358,6 +373,7 @@ SETUP: dict[str, Callable[..., object]] = {
 }
 AFTER_START: dict[str, Callable[..., object]] = {
     r"(\d+) cycles?": lambda case, count: case.rig.cycles(int(count)),
+    r"(\d+) Hz": lambda case, rate: setattr(case.rig, "period_ns", 1_000_000_000 // int(rate)),
     r"without the loop for (\S+) s": lambda case, seconds: case.rig.wait(round(float(seconds) * 1e9)),
     r"goals sway": lambda case: setattr(case.rig, "restless", 0.006),
     r"torque (on|off) (\d+)": lambda case, on, servo_id: case.rig.hardware.switch_torque(
@@ -417,5 +433,6 @@ EXPECTATIONS: dict[str, Callable[..., object]] = {
     ),
     r"mode (\d+): (\w+)": Case.expect_mode,
     r"(\d+) is at (\S+) deg": Case.expect_place,
+    r"error (\d+): (\d+)": Case.expect_error,
     r"(\d+) (stands|turns)": Case.expect_turning,
 }
