@@ -9,7 +9,7 @@ from functools import partial
 import pytest
 from msgspec.structs import replace
 from tests.kit.plans import distinct_tables
-from tests.kit.rigs import Rig, VirtualLine, make_plan, make_rig, make_x, start_rig
+from tests.kit.rigs import Rig, VirtualLine, make_plan, make_rig, start_rig
 
 from dxlrun.channels.event_records import EventCode, Severity
 from dxlrun.compile.joints.register_values import UnfitRegister
@@ -77,22 +77,6 @@ def test_torque_comes_in_groups():
     times = [e.t_ns for e in rig.ledger.entries if e.direction == "in" and e.data[4:7] == b"\x03\x18\x01"]
     pauses = [b - a > 20_000_000 for a, b in itertools.pairwise(times)]
     assert pauses == [False, False, True, False, False, True, False]
-
-
-@pytest.mark.parametrize(
-    ("item", "refused"),
-    [("position_p_gain", False), ("bus_watchdog", True), ("drive_mode", True), ("operating_mode", True)],
-)
-def test_refused_read_is_fatal_only_for_an_item_that_decides(item, refused):
-    rig = make_rig(make_x((1,)))
-    rig.servo(1).poke("temperature_limit", 70)
-    rig.servo(1).refuse_reads(find_table("XM430-W350").items[item].address)
-    if refused:
-        assert " rejects reads: " in rig.refused()[0]
-        return
-    rig.hardware.start()
-    (text,) = rig.events.texts(EventCode.REGISTER_DIFFERS)
-    assert "Temperature Limit (31) = 70" in text
 
 
 def others(table):

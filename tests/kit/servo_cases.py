@@ -387,6 +387,7 @@ AFTER_START: dict[str, Callable[..., object]] = {
     r"goal (\d+): (.+)": Case.give_goal,
     r"torque limited to (\S+) of (\d+)": Case.limit_torque,
     r"the loop dies": Case.stand,
+    r"left with its torque on": lambda case: case.rig.hardware.leave_torque_on(),
     r"bus unplugged": lambda case: case.rig.buses[0].unplug(),
     r"bus plugged in": lambda case: case.rig.buses[0].plug_in(),
     r"stop": Case.stop,
@@ -418,6 +419,9 @@ CHANGES: dict[str, Callable[..., object]] = {
         case.rig.buses[0], servo.servo_id, round(float(time) * 1e6)
     ),
     r"write lost": lambda case, _: case.rig.buses[0].alter_next_instruction("lost", lambda _: b""),
+    r"refuses reads of (\w+)": lambda _, servo, name: servo.refuse_reads(
+        servo.registers.table.items[name].address
+    ),
     r"boots in (\S+) s": lambda _, servo, time: setattr(servo, "boot_ns", round(float(time) * 1e9)),
     r"keeps (\w+) (-?\d+)": lambda case, servo, name, value: case.rig.stick(servo.servo_id, name, int(value)),
     r"(\w+) (-?\d+)": poke,
