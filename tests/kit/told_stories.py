@@ -201,11 +201,11 @@ class Story:
     def _written(self, number: int, name: str) -> Iterator[int]:
         """Yield the values of an item that a servo was sent, by the ledger."""
         for bus in self.virtual.plan.buses:
-            for servo in bus.servos:
+            for servo in (one for one in bus.servos if one.servo_id == number):
                 item = find_table(servo.model, bus.protocol).items[name]
                 for _, servo_id, first, data in all_writes(self.virtual.ledger.entries, bus):
                     end = item.address + item.size - first
-                    if servo_id == number == servo.servo_id and first <= item.address and end <= len(data):
+                    if servo_id == number and first <= item.address and end <= len(data):
                         yield int.from_bytes(data[item.address - first : end], "little")
 
     def values(self, column: str, name: str, match: re.Match[str]) -> Any:

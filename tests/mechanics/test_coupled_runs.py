@@ -11,7 +11,7 @@ from tests.kit.sampled_run import SampledRun
 from tests.kit.stories import send
 from tests.kit.wire import all_writes
 
-from dxlrun.channels.answers import Completion, Refusal
+from dxlrun.channels.answers import Refusal
 from dxlrun.channels.commands import CommandMessage
 from dxlrun.channels.cycle import Commands, States
 from dxlrun.channels.event_records import EventCode, Severity
@@ -22,11 +22,8 @@ from dxlrun.features.mechanics.joint_hardware import CouplingCheck
 from dxlrun.log.log_reader import read_log
 from dxlrun.run import virtual_run
 from dxlrun.run.virtual_run import VirtualRobot
-from dxlrun_analysis.replay import replay_log
 from dxlrun_controllers.group import (
     JointGroupPositionController,
-    JointGroupPosVelController,
-    JointGroupVelocityController,
 )
 
 pytestmark = pytest.mark.long
@@ -159,61 +156,6 @@ def test_servos_that_begin_to_disagree_in_the_run_are_one_event_until_they_agree
     assert len(events.list) == 3
 
 
-CLASSES = {
-    "velocity": JointGroupVelocityController,
-    "posvel": JointGroupPosVelController,
-}
-
-
-@pytest.fixture
-def turned(plan, monkeypatch, tmp_path):
-    """Run with a controller of a kind that gives some joints goals; return what each servo was sent most."""
-
-    def run(kind, joints, others, duration_s, place, **given):
-        def update(controller, time_ns, period_ns):
-            for goal, values in given.items():
-                getattr(controller.context.commands, goal)[:] = values
-
-        monkeypatch.setattr(CLASSES[kind], "update", update)
-        turn = f"  turn: {{type: joint_group_{kind}_controller, joints: [{joints}]}}"
-        change = ("joints: [head, hip, gripper, pitch, roll]}", f"joints: [{others}]}}\n{turn}")
-        robot = VirtualRobot(plan(change, duration_s=duration_s), log=tmp_path / "run.mcap")
-        robot.run()
-        address, unit = place
-        sent = {}
-        for servo in (1, 2, 3, 5, 6, 7):
-            ticks = [
-                int.from_bytes(data[:4], "little", signed=True) for _, data in written(robot, servo, address)
-            ]
-            sent[servo] = max(ticks, key=abs, default=0) * unit
-        return {servo: goal for servo, goal in sent.items() if goal}
-
-    return run
-
-
-VELOCITY = 0.229 * math.tau / 60  # rad/s a tick
-
-
-SPEEDS = {1: 0.8, 7: 0.02 / 0.0942 * math.tau}
-"""Of the servos, where the head turns at 0.4 rad/s and the gripper at 20 mm/s: 2 : 1, and 94.2 mm a turn."""
-
-
-def test_speeds_of_geared_and_linear_joints_are_their_own(turned, tmp_path):
-    place = (104, VELOCITY)
-    sent = turned("velocity", "head, gripper", "hip, pitch, roll", 1.0, place, velocity=[0.4, 0.02])
-    assert sent == pytest.approx(SPEEDS, abs=VELOCITY)
-    head, _, gripper, *_ = read_log(tmp_path / "run.mcap").cycles["velocity"][-10]
-    assert head == pytest.approx(0.4, abs=VELOCITY)
-    assert gripper == pytest.approx(0.02, abs=2 * VELOCITY * 0.0942 / math.tau)
-
-
-def test_the_speed_toward_a_position_is_the_servos_own(turned):
-    place = (112, VELOCITY)  # Profile Velocity stands in front of Goal Position (116)
-    goals = {"position": [0.2, 0.01], "velocity": [0.4, 0.02]}
-    sent = turned("posvel", "head, gripper", "hip, pitch, roll", 0.2, place, **goals)
-    assert {servo: sent[servo] for servo in SPEEDS} == pytest.approx(SPEEDS, abs=VELOCITY)
-
-
 def test_a_controller_for_one_joint_of_a_wrist_is_not_loaded_in_another_mode(plan):
     robot = VirtualRobot(plan())
     known = robot.plan.loop.controllers[1]
@@ -253,38 +195,12 @@ def test_a_lost_servo_holds_its_partner_where_it_is(plan, sways):
     assert result.invalid[0] == 0
 
 
-def test_with_the_policy_limp_the_partner_of_a_lost_servo_loses_its_torque(plan):
-    more = "policies: {groups: {legs: {joints: [hip], on_lost_servo: limp}}}\n"
-    robot = VirtualRobot(plan(more=more, duration_s=1.4))
-    lose(robot, 3)
-    robot.run()
-    offs = [t for t, data in written(robot, 2, 64) if data == b"\0" and GONE_NS < t < BACK_NS]
-    assert offs
-    assert not goals(robot, 2, offs[0])
-
-
 def ask_torque(robot, joint, *wanted):
     """Let a client ask for the torque of a joint, each at its time, ms."""
     for number, (ms, on) in enumerate(wanted, 1):
         data = f'{{"joints": ["{joint}"], "on": {on}, "release": true}}'.encode()
         command = CommandMessage(number, "", "torque", data, "anna")
         robot.buses[0].at(ms * 1_000_000, partial(robot.inbox.waiting.append, command))
-
-
-@pytest.mark.parametrize("joint", ["hip", "roll"])
-def test_torque_off_at_one_joint_is_off_at_all_its_servos_together(plan, joint, tmp_path):
-    servos = (2, 3) if joint == "hip" else (5, 6)
-    robot = VirtualRobot(plan(duration_s=1.2), log=tmp_path / "run.mcap")
-    ask_torque(robot, joint, (400, "false"), (800, "true"))
-    robot.run()
-    assert all(isinstance(robot.inbox.answers[number], Completion) for number in (1, 2))
-    for servo in servos:
-        assert torque(robot, servo, 300_000_000)[:2] == [0, 1]
-    for servo in {1, 2, 3, 5, 6, 7} - {*servos}:
-        assert 1 not in torque(robot, servo, 300_000_000, 1_150_000_000)
-    # a replay needs the joints alone: it re-runs the log without a servo
-    report = replay_log(tmp_path / "run.mcap")
-    assert (report.different, report.first, report.fault) == (0, None, "")
 
 
 @pytest.mark.parametrize(
