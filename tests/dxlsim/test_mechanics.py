@@ -267,7 +267,7 @@ def next_step(mechanics: Mechanics) -> int:
 def test_in_real_time_it_advances_often_while_it_moves_and_seldom_while_it_cools():
     mechanics = one(pid(5.0, 1.0))
     mechanics.step_to(100_000_000)
-    assert next_step(mechanics) == mechanics.grid_ns + 4_000_000
+    assert next_step(mechanics) == mechanics.grid_ns + 8_000_000
     mechanics.step_to(3 * S)
     mechanics.heat(0, 30.01)
     mechanics.step_to(4 * S)
@@ -276,6 +276,9 @@ def test_in_real_time_it_advances_often_while_it_moves_and_seldom_while_it_cools
     assert next_step(mechanics) > 1 << 62
     mechanics.call_at(2_001 * S, lambda: None)
     assert next_step(mechanics) == 2_001 * S + STEP_NS
+    mechanics.call_at(2_000 * S + 1, lambda: None)
+    mechanics.step_to(2_000 * S + STEP_NS)  # The action is due, and the next step does it
+    assert next_step(mechanics) == 2_000 * S + 2 * STEP_NS
 
 
 DT = 0.002

@@ -26,8 +26,9 @@
 #define UNWOUND 1e-6 /* duty/s; an integral that changes the duty more slowly counts as constant */
 #define LEAST_P 1e-9 /* duty per rad; bounds the integrated speed error of a velocity controller with a tiny gain */
 /* Intervals at which a step is due in real time while servos move, and while they only cool, ns. Catching up after a long
- * pause of the host would delay the next reply. */
-#define EAGER_NS 4000000
+ * pause of the host would delay the next reply. A sleep that ends before the next tick of a stock Linux (4 ms) sets the
+ * timer of the processor, which takes some 10 us in a virtual machine. */
+#define EAGER_NS 8000000
 #define EASY_NS 1000000000
 #define STEPS_A_LOOK 16 /* steps between two checks for rest */
 #define STILL 1e-6      /* rad/s; a servo rests below it, and below UNDRIVEN */
@@ -357,8 +358,10 @@ int64_t motion_next_step(const Mechanics *m)
         return INT64_MAX;
     if (!m->still)
         return m->grid_ns + EAGER_NS;
-    if (action_ns != INT64_MAX)
-        action_ns += m->step_ns;
+    if (action_ns != INT64_MAX) { /* it is done by the step after the first point of the grid at or after its time */
+        int64_t steps = action_ns > m->grid_ns ? (action_ns - m->grid_ns + m->step_ns - 1) / m->step_ns : 0;
+        action_ns = m->grid_ns + (steps + 1) * m->step_ns;
+    }
     return m->calm || action_ns < easy_ns ? action_ns : easy_ns;
 }
 

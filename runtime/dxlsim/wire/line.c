@@ -1637,6 +1637,7 @@ int32_t line_port_wait(Ports *p, int64_t deadline_ns, uint8_t *ready) { return p
 
 #define CHUNK 4096                   /* bytes of one read; a shorter result means that no more bytes are waiting */
 #define MOST_BACKLOG_NS 20000000     /* host's bytes that wait for the wire, as wire time; then the host is not read */
+#define TOGETHER_NS 50000            /* replies of several lines that end within this time are delivered together */
 #define GATHER_NS 250000             /* replies that end within this time are delivered together, as by USB */
 #define LONGEST_SLEEP_NS 10000000    /* while a host watches the progress, so that a longer pause shows as a stall */
 #define STALL_NS 20000000            /* pause between two readings of the clock from which it counts as a stall */
@@ -1653,6 +1654,7 @@ typedef struct { /* simulation's end of a terminal, whose other end hosts open l
     Bus *bus;
     int64_t *progress; /* words of the line's progress; NULL: nobody watches */
     int64_t taken_ns, served_ns;
+    int64_t due_ns;    /* of the next delivery */
     int64_t held_ns;   /* time until which the terminal is not read because its host is too fast; 0: it is read */
     int32_t descriptor, opened; /* `opened`: how often the adapter had been unplugged */
     int32_t plugged, ready, size, known;
@@ -1718,15 +1720,21 @@ static int has_run_task(const Server *s)
     return any;
 }
 
-/* Return the time of the next delivery to any host, NEVER without one; publish it for each line. */
+/* Return the time of the next delivery to any host, NEVER without one, or of the last one that is due shortly after it.
+ * Publish the time of each line. */
 static int64_t find_delivery(const Server *s)
 {
-    int64_t soonest_ns = NEVER;
+    int64_t soonest_ns = NEVER, last_ns;
     for (int32_t i = 0; i < s->count; i++) {
-        int64_t due_ns = publish_served(s->terminals[i]);
+        int64_t due_ns = s->terminals[i]->due_ns = publish_served(s->terminals[i]);
         soonest_ns = due_ns < soonest_ns ? due_ns : soonest_ns;
     }
-    return soonest_ns;
+    last_ns = soonest_ns;
+    for (int32_t i = 0; i < s->count; i++) {
+        int64_t due_ns = s->terminals[i]->due_ns;
+        last_ns = due_ns > last_ns && due_ns - soonest_ns < TOGETHER_NS ? due_ns : last_ns;
+    }
+    return last_ns;
 }
 
 static int32_t changed(const Terminal *t)
@@ -1846,30 +1854,31 @@ static void wait_for_event(Server *s, int64_t due_ns, int64_t easy_ns)
     struct pollfd one = {s->waiting, POLLIN, 0};
     struct timespec timeout = {left_ns / 1000000000, left_ns % 1000000000};
     /* ppoll, because epoll alone has only milliseconds */
-    if (left_ns <= 0 || ppoll(&one, 1, until_ns == NEVER ? NULL : &timeout, NULL))
-        look(s);
-    else if (until_ns == wake_ns) {
-        s->early_ns = line_early(s->early_ns, clock_ns() - wake_ns);
-        while (clock_ns() < due_ns) /* rarely: most sleeps end later than the estimate */
-            ;
-    }
+    if (left_ns > 0 && !ppoll(&one, 1, until_ns == NEVER ? NULL : &timeout, NULL)) {
+        if (until_ns == wake_ns)
+            s->early_ns = line_early(s->early_ns, clock_ns() - wake_ns);
+        left_ns = 0;
+    } else if (look(s))
+        left_ns = 1;
+    while (left_ns <= 0 && until_ns == wake_ns && clock_ns() < due_ns) /* rarely: most sleeps end later */
+        ;
     s->acquire(thread);
 }
 
-/* Deliver what is due, the next at `due_ns`, and receive what hosts have written. */
-static void serve_event(Server *s, int64_t due_ns)
+/* Deliver what is due, and receive what hosts have written. */
+static void serve_event(Server *s)
 {
     int64_t now_ns = look_at_clock(s);
     /* Replies that were due before the host wrote go out first, because the host could have read them. */
-    for (int32_t i = 0; due_ns <= now_ns && i < s->count; i++)
-        if (line_next_delivery(s->terminals[i]->bus, GATHER_NS) <= now_ns)
+    for (int32_t i = 0; i < s->count; i++)
+        if (s->terminals[i]->due_ns <= now_ns)
             deliver(s, s->terminals[i], now_ns);
     for (int32_t rounds = s->count, any = 1; any;) { /* a host that drives all buses writes to them in one go */
         any = 0;
         for (int32_t i = 0; i < s->count; i++)
             if (s->terminals[i]->ready) {
                 line_read_chunk(s->terminals[i]);
-                any = 1;
+                any++;
             }
         /* Read after the bytes, so that no host gets a reply before it wrote, even if other lines take long */
         now_ns = look_at_clock(s);
@@ -1878,7 +1887,7 @@ static void serve_event(Server *s, int64_t due_ns)
                 s->terminals[i]->ready = 0;
                 receive_from(s, i, now_ns);
             }
-        any = any && --rounds > 0 && look(s);
+        any = any && any < s->count && --rounds > 0 && look(s);
     }
 }
 
@@ -1929,7 +1938,7 @@ int32_t line_serve(Server *s)
             easy_ns = work_in_idle_time(s, now_ns);
         if (!has_run_task(s)) {
             wait_for_event(s, due_ns, easy_ns);
-            serve_event(s, due_ns);
+            serve_event(s);
         }
         left = s->news || s->single || s->looked_ns >= s->python_ns || has_run_task(s);
     }
