@@ -15,6 +15,7 @@ from dxlrun.plan.loop_plan import JointPlan
 from dxlrun.testing import read_log, simulated_robot
 from dxlrun_analysis.finding import Finding, Rank
 from dxlrun_analysis.joints.following import followed
+from dxlrun_analysis.joints.joint_columns import JointColumns
 from dxlrun_analysis.joints.movement import Movement
 from dxlrun_analysis.joints.planned import PlannedJoint
 from dxlrun_analysis.joints.trail import STEP_S, Trail
@@ -74,11 +75,11 @@ def findings(*joints: Joint, names: Sequence[str] = ()) -> list[Finding]:
         planned.append(PlannedJoint(names[row] if names else f"j{row}", **facts))
     references = [f"pid/{joint.name}/position" for joint in planned]
     movement = Movement(planned, int(cycles["read_ns"][0]), references)
-    ways = np.array([joint.way for joint in joints]).T
+    ways = np.array([joint.way for joint in joints])
     for begin in range(0, len(TIME), 150):  # slice by slice, two cycles of the one before with each
         known = min(begin, 2)
         part = slice(begin - known, begin + 150)
-        movement.add_cycles(cycles[part], ways[part], known)
+        movement.add_cycles(JointColumns(cycles[part]), ways[:, part], known)
     return list(movement.findings())
 
 

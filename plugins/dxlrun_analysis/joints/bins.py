@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,23 +25,26 @@ class Bins:
         self.begin_ns, self.bin_ns = begin_ns, _FIRST_BIN_NS
         self._values = [np.full(shape, empty) for _, empty in _JOINS]
 
-    def bin_cycles(self, times: NDArray[np.int64], values: Floats) -> None:
+    def bin_cycles(self, times: NDArray[np.int64], values: Sequence[Floats]) -> None:
         """Add the values of some cycles to their bins.
 
         Args:
             times: Times of the cycles in ns, shape (cycles,).
-            values: Values, NaN if unknown; shape (quantities, cycles, joints).
+            values: Values of each quantity, NaN if unknown; shape (joints, cycles).
         """
         while int(times[-1]) - self.begin_ns >= _BINS * self.bin_ns:
             self._halve()
         index = np.clip((times - self.begin_ns) // self.bin_ns, 0, _BINS - 1)
         starts = np.flatnonzero(np.diff(index, prepend=-1))
-        bins, known = index[starts], np.isfinite(values)
-        parts = [np.where(known, values, empty) for _, empty in _JOINS[:3]]
-        for (join, _), array, part in zip(
-            _JOINS, self._values, [*parts, known.astype(np.float64)], strict=True
-        ):
-            array[:, bins] = join(array[:, bins], join.reduceat(part, starts, axis=1))
+        bins, lengths = index[starts], np.diff(starts, append=len(index)).astype(np.float64)
+        for quantity, every in enumerate(values):
+            known = np.isfinite(every)
+            whole = known.all()
+            for (join, empty), array in zip(_JOINS[:3], self._values[:3], strict=True):
+                part = every if whole else np.where(known, every, empty)
+                array[quantity, bins] = join(array[quantity, bins], join.reduceat(part, starts, axis=1).T)
+            counts = lengths[:, None] if whole else np.add.reduceat(known, starts, axis=1, dtype=np.float64).T
+            self._values[3][quantity, bins] += counts
 
     def _halve(self) -> None:
         """Merge the bins in pairs, which doubles their length."""

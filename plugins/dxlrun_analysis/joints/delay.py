@@ -53,15 +53,23 @@ class DelayFit:
         finite = goal[known:][np.isfinite(goal[known:])]
         if len(finite):
             self.lowest, self.highest = min(self.lowest, finite.min()), max(self.highest, finite.max())
+        whole = len(finite) == len(position) and bool(np.isfinite(self.goals).all())
+        whole = whole and bool(np.isfinite(position).all())
+        constant = whole and before > (_DELAYS - 1) * self.step and bool((goals == goals[0]).all())
+        squares, count = 0.0, 0
         for index in range(_DELAYS):
             back = index * self.step + 1  # A goal reaches the servo after the read of its cycle
             first = max(0, back - before)
             if first >= len(position):
                 continue
-            difference = position[first:] - goals[before + first - back : len(goals) - back]
-            difference = difference[np.isfinite(difference)]
-            self.squares[index] += np.square(difference).sum()  # A matrix product would start BLAS threads
-            self.counts[index] += len(difference)
+            if not (constant and index):  # A constant goal differs equally at each delay
+                difference = position[first:] - goals[before + first - back : len(goals) - back]
+                if not whole:
+                    difference = difference[np.isfinite(difference)]
+                squares = np.square(difference).sum()  # A matrix product would start BLAS threads
+                count = len(difference)
+            self.squares[index] += squares
+            self.counts[index] += count
         self.goals = goals[-_DELAYS * self.step - 1 :]
 
     def best_s(self, least: float) -> float | None:

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from dxlrun import ROTARY, Floats, JointUnit, Log
 from dxlrun.tooling.records import Torque
 from dxlrun_analysis.joints.delay import DelayFit
+from dxlrun_analysis.joints.joint_columns import JointColumns
 from dxlrun_analysis.joints.movement import Movement
 from dxlrun_analysis.joints.planned import PlannedJoint, planned_joints
 
@@ -73,7 +74,7 @@ def tracking(log: Log) -> tuple[JointTracking, ...]:
 def reachable(log: Log, row: int) -> Floats:
     """Return the reachable trajectory of joint number `row` in each cycle, rad; NaN without a goal."""
     limits = planned_joints(log)[row]
-    return _reachable(_sent(log.cycles, row, limits), limits.acceleration, _Way())
+    return _reachable(_sent(JointColumns(log.cycles), row, limits), limits.acceleration, _Way())
 
 
 # Reachable trajectory
@@ -89,16 +90,20 @@ class _Way:
     velocity: float = 0.0
 
 
-def _sent(cycles: NDArray[np.void], row: int, limits: PlannedJoint) -> _SentGoals:
-    goal: Floats = cycles["goal_position"][:, row].astype(np.float64)
-    # When torque is enabled, the servo holds its position; an earlier goal no longer applies.
-    goal[cycles["torque"][:, row] == Torque.GIVEN] = np.nan
-    position = np.where(cycles["valid"][:, row], cycles["position"][:, row], np.nan)
-    commanded = np.abs(cycles["goal_velocity"][:, row])
+def _sent(columns: JointColumns, row: int, limits: PlannedJoint) -> _SentGoals:
+    goal, position, commanded = (
+        columns[name][row] for name in ("goal_position", "position", "goal_velocity")
+    )
+    given, valid = columns["torque"][row] == Torque.GIVEN, columns["valid"][row]
+    if (
+        given.any()
+    ):  # When torque is enabled, the servo holds its position; an earlier goal no longer applies.
+        goal = np.where(given, np.nan, goal)
+    if not valid.all():
+        position = np.where(valid, position, np.nan)
+    commanded = np.abs(commanded)
     speed = np.where(np.isfinite(commanded), np.maximum(commanded, limits.slowest), math.inf)
-    times = cycles["read_ns"] * 1e-9
-    steps = np.diff(times, prepend=times[:1])
-    return _SentGoals(goal, np.minimum(speed, limits.speed), position, steps)
+    return _SentGoals(goal, np.minimum(speed, limits.speed), position, columns.steps)
 
 
 def _reachable(sent: _SentGoals, acceleration: float, begun: _Way) -> Floats:
@@ -114,7 +119,7 @@ def _reachable(sent: _SentGoals, acceleration: float, begun: _Way) -> Floats:
     way[:known] = begun.last
     jumps = np.zeros(len(goal), dtype=bool)
     # Step through cycles in Python only where a goal cannot be reached within one cycle.
-    jumps[2:] = ~(np.abs(np.diff(goal[:-1])) <= speed[1:-1] * steps[2:] * (1 + 1e-9))
+    jumps[2:] = ~(np.abs(np.diff(goal[:-1])) <= speed[1:-1] * steps[1:] * (1 + 1e-9))
     jumps[:2] = True
     jumps[:known] = False
     if begun.behind and known < len(goal):
@@ -139,7 +144,13 @@ class _SentGoals:
     goal: Floats  # rad
     speed: Floats  # rad/s, commanded speed of the movement
     position: Floats  # rad; NaN if it was not read
-    steps: Floats  # s since the preceding cycle
+    steps: Floats  # s between two cycles, shape (cycles - 1,)
+
+
+def _finite(values: Floats) -> Floats:
+    """Return the finite ones of some values."""
+    finite = np.isfinite(values)
+    return values if finite.all() else values[finite]
 
 
 def _go(start: int, way: Floats, sent: _SentGoals, acceleration: float, begun: _Way) -> int:
@@ -156,7 +167,7 @@ def _go(start: int, way: Floats, sent: _SentGoals, acceleration: float, begun: _
             way[cycle] = at
             cycle += 1
             continue
-        left, dt = desired - at, float(sent.steps[cycle])
+        left, dt = desired - at, float(sent.steps[cycle - 1])
         fastest = math.copysign(float(sent.speed[cycle - 1]), left)
         if acceleration < math.inf:
             # Braking must stay possible: v^2 / 2a plus half of this step's distance equals the remaining
@@ -197,9 +208,8 @@ class _OpenRest:
     It is fed with slices of cycles, and keeps the cycles of a rest that has not ended, 20 s at most.
     """
 
-    times: Floats = field(default_factory=lambda: np.zeros(0))
-    way: Floats = field(default_factory=lambda: np.zeros(0))
-    error: Floats = field(default_factory=lambda: np.zeros(0))
+    held: list[tuple[Floats, Floats, Floats]] = field(default_factory=list)
+    """Times, desired positions and errors of the kept cycles, whose desired position is constant."""
     lowest: float = math.inf
     highest: float = -math.inf  # Range of the desired positions since the last rest, before the kept cycles
 
@@ -217,9 +227,10 @@ class _OpenRest:
             tick: Resolution of the servo's position, rad.
             final: No more cycles follow.
         """
-        times, way, error = (
-            np.concatenate(pair) for pair in ((self.times, times), (self.way, way), (self.error, error))
-        )
+        self.held.append((times, way, error))
+        if not final and self._goes_on():
+            return
+        times, way, error = (np.concatenate(column) for column in zip(*self.held, strict=True))
         still = np.zeros(len(way) + 1, dtype=bool)
         still[1:-1] = way[1:] == way[:-1]
         begins = np.flatnonzero(still[1:] & ~still[:-1]).tolist()
@@ -248,10 +259,16 @@ class _OpenRest:
             settling_s = float(times[settled] - times[begin]) if moved >= near else None
             yield _Rest(settling_s, rest_rad)
         self._saw(way[moved_from:keep])
-        self.times, self.way, self.error = times[keep:], way[keep:], error[keep:]
+        self.held = [(times[keep:], way[keep:], error[keep:])]
+
+    def _goes_on(self) -> bool:
+        """Return whether the newest cycles continue the rest of the kept ones, which does not end yet."""
+        (begun, before, _), (times, way, _) = self.held[0], self.held[-1]
+        lasted = len(before) and len(way) and times[-1] - begun[0] < _LONGEST_REST_S
+        return bool(lasted and (way == before[0]).all())
 
     def _saw(self, way: Floats) -> None:
-        known = way[np.isfinite(way)]
+        known = _finite(way)
         if len(known):
             self.lowest, self.highest = min(self.lowest, known.min()), max(self.highest, known.max())
 
@@ -298,8 +315,9 @@ class TrackingCollector:
         known = 0 if self._held is None else len(self._held)
         cycles = np.concatenate(self._parts if self._held is None else [self._held, *self._parts])
         self._parts, self._count = [], 0
-        ways = [row.track_cycles(cycles, known) for row in self._rows]
-        self.movement.add_cycles(cycles, np.array(ways).reshape(len(ways), len(cycles)).T, known)
+        columns = JointColumns(cycles)
+        ways = [row.track_cycles(columns, known) for row in self._rows]
+        self.movement.add_cycles(columns, np.array(ways).reshape(len(ways), len(cycles)), known)
         self._held = cycles[-2:].copy()
 
 
@@ -326,24 +344,24 @@ class _JointAccumulator:
     rest_rad: float | None = None
     delays: DelayFit = field(default_factory=DelayFit)
 
-    def track_cycles(self, cycles: NDArray[np.void], known: int) -> Floats:
+    def track_cycles(self, columns: JointColumns, known: int) -> Floats:
         """Add the cycles from number `known` on; the first `known` were already added. Return the
         reachable trajectory of all, rad."""
-        new = cycles[known:]
-        missing = ~new["valid"][:, self.row] & (new["torque"][:, self.row] != Torque.REBOOTING)
+        new = {name: columns[name][self.row, known:] for name in ("valid", "torque", "age_ns", "clamped")}
+        missing = ~new["valid"] & (new["torque"] != Torque.REBOOTING)
         self.invalid += int(np.count_nonzero(missing))
-        self.oldest_ns = max(self.oldest_ns, int(new["age_ns"][:, self.row].max(initial=0)))
-        self.clamped += int(np.count_nonzero(new["clamped"][:, self.row]))
-        lost = np.flatnonzero(new["torque"][:, self.row] == Torque.LOST)
-        if self.lost_at is None and len(lost) and math.isfinite(at := new["position"][lost[0], self.row]):
-            self.lost_at = float(at)
-        sent = _sent(cycles, self.row, self.limits)
+        self.oldest_ns = max(self.oldest_ns, int(new["age_ns"].max(initial=0)))
+        self.clamped += int(np.count_nonzero(new["clamped"]))
+        if self.lost_at is None and len(lost := np.flatnonzero(new["torque"] == Torque.LOST)):
+            at = columns["position"][self.row, known + lost[0]]
+            self.lost_at = float(at) if math.isfinite(at) else None
+        sent = _sent(columns, self.row, self.limits)
         way = _reachable(sent, self.limits.acceleration, self.way)
-        times = cycles["read_ns"] * 1e-9
+        times = columns.times
         error = sent.position - way
         if not known:
             error[:1] = np.nan  # The trajectory begins at this position, so its error is 0 by definition
-        finite = error[known:][np.isfinite(error[known:])]
+        finite = _finite(error[known:])
         self.errors += len(finite)
         self.squares += float((finite**2).sum())
         self.worst = max(self.worst, float(np.abs(finite).max(initial=0.0)))
@@ -365,12 +383,13 @@ class _JointAccumulator:
             return
         velocity = (way[2:] - way[:-2]) / (times[2:] - times[:-2])
         inner = error[1:-1]
-        used = np.isfinite(velocity) & np.isfinite(inner)
-        if used.any():
-            there = way[1:-1][used]
+        used, there = np.isfinite(velocity) & np.isfinite(inner), way[1:-1]
+        if not used.all():
+            there, inner, velocity = there[used], inner[used], velocity[used]
+        if len(there):
             self.lowest, self.highest = min(self.lowest, there.min()), max(self.highest, there.max())
-            self.across += float(inner[used] @ velocity[used])
-            self.moved += float(velocity[used] @ velocity[used])
+            self.across += float(inner @ velocity)
+            self.moved += float(velocity @ velocity)
 
     def result(self, name: str) -> JointTracking:
         moved = self.highest - self.lowest >= _MOVED_TICKS * self.limits.tick

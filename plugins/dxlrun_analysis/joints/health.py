@@ -75,7 +75,7 @@ class ServoHealth:
             self._bins = Bins(len(_QUANTITIES), len(log.joints), int(cycles["read_ns"][0]))
             self._faults = [set() for _ in log.joints]
             self._volts = np.full(len(log.joints), np.nan)
-        self._bins.bin_cycles(cycles["read_ns"], np.array([cycles[name] for name in _QUANTITIES]))
+        self._bins.bin_cycles(cycles["read_ns"], [cycles[name].T for name in _QUANTITIES])
         for joint, faults, values in zip(self._joints, self._faults, cycles["hardware_error"].T, strict=True):
             for value in np.unique(values).tolist():
                 faults.update(joint.faults(value))

@@ -29,10 +29,16 @@ from dxlrun_analysis.joints.failing import (
     joint_finding,
 )
 from dxlrun_analysis.joints.following import changed, followed
+from dxlrun_analysis.joints.joint_columns import JointColumns
 from dxlrun_analysis.joints.planned import PlannedJoint
 from dxlrun_analysis.joints.trail import Trail
 
 _NONE: Mapping[str, float] = {}
+_FIELDS = (
+    *("read_ns", "age_ns", "torque", "valid", "position", "velocity", "effort"),
+    *("goal_position", "goal_effort"),
+)
+"""Fields of the cycles that are used."""
 _WINDOW_S = 0.5  # Length of the long windows
 _JUMP_S = 0.5  # Positions further apart are not compared: the joint may have been moved by hand
 _TOO_FAST = 1.25  # A supply at its limit and a pulling load make a servo slightly faster than its model
@@ -91,94 +97,114 @@ class Movement:
         self.bins = Bins(8, len(joints), begin_ns)
         self._trail = Trail(len(joints), begin_ns)
 
-    def add_cycles(self, cycles: NDArray[np.void], way: Floats, known: int) -> None:
+    def add_cycles(self, columns: JointColumns, way: Floats, known: int) -> None:
         """Add the cycles from number `known` on; the first `known` were already added, and are used for
         speeds only.
 
         Args:
-            cycles: Cycles of the log.
-            way: Reachable trajectories, rad or m; shape (cycles, joints).
+            columns: Cycles of the log.
+            way: Reachable trajectories, rad or m; shape (joints, cycles).
             known: Number of cycles that were added before.
         """
-        speed = np.full_like(way, np.nan)
-        steps = np.diff(cycles["read_ns"] * 1e-9)[:, None]
-        speed[1:] = np.abs(np.diff(way, axis=0)) / steps
-        moved = np.zeros_like(way)
-        moved[1:] = np.abs(np.diff(cycles["position"], axis=0)) / steps
-        cycles, way, speed, moved = cycles[known:], way[known:], speed[known:], moved[known:]
-        if not len(cycles):
+        if known >= len(columns):
             return
+        speed, moved = np.full_like(way, np.nan), np.zeros_like(way)
+        np.divide(np.abs(np.diff(way)), columns.steps, out=speed[:, 1:])
+        np.divide(np.abs(np.diff(columns["position"])), columns.steps, out=moved[:, 1:])
+        new = {name: columns[name][..., known:] for name in _FIELDS}
+        way, speed, moved, position = way[:, known:], speed[:, known:], moved[:, known:], new["position"]
+        has_torque = new["torque"] == Torque.ON
+        moves = has_torque & new["valid"]
         # A joint with an effort goal has no reachable trajectory.
-        driven = (cycles["torque"] == Torque.ON) & cycles["valid"] & ~np.isfinite(cycles["goal_effort"])
-        at_ns = cycles["read_ns"][:, None] - cycles["age_ns"]
-        for row, joint in enumerate(self._joints):
-            kept = driven[:, row] | (cycles["torque"][:, row] != Torque.ON)
-            jumping = np.where(driven, cycles["position"], np.nan)[kept, row]
-            self._jumps[row].add_positions(joint, at_ns[kept, row], jumping)
-        position = np.where(driven & np.isfinite(way), cycles["position"], np.nan)
-        error = position - way
-        velocity = np.nan_to_num(cycles["velocity"])
-        fastest = np.maximum.accumulate(np.vstack([self._fastest, np.abs(velocity)]))[1:]
-        self._fastest = fastest[-1]
-        fastest = np.maximum(
-            fastest, [_SLOWEST_TOP * (joint.logged.top_speed or 0) for joint in self._joints]
-        )
-        # A joint that approaches its goal at full speed is not at fault for its error.
-        hurries = (velocity * error < 0) & (np.abs(velocity) >= _FULL_SPEED * fastest)
-        hurries &= moved >= _FULL_SPEED / 2 * np.abs(velocity)
+        by_effort = np.isfinite(new["goal_effort"])
+        driven = moves & ~by_effort
+        free = position if driven.all() else np.where(driven, position, np.nan)
+        self._add_positions(new["read_ns"] - new["age_ns"], free, driven | ~has_torque)
+        error = np.where(np.isfinite(way), free, np.nan) - way
         unknown = np.isnan(error)
-        sought = self._sought(cycles)
-        off = np.where(unknown, cycles["position"] - sought, error)
-        swings = self._swings(cycles, off) - self._told(cycles, np.where(unknown, sought, way))
+        hurries = self._hurries(np.nan_to_num(new["velocity"]), error, moved)
+        away = np.abs(error)
+        if hurries is not None:
+            away[hurries] = 0.0
+        off, led = error, way
+        if unknown.any():
+            sought = self._sought(columns, moves & by_effort, known)
+            off, led = np.where(unknown, position - sought, error), np.where(unknown, sought, way)
+        rate = 1e9 / max(float(np.median(np.diff(new["read_ns"]))), 1.0) if position.shape[1] > 2 else 0.0
+        swings = self._swings(off, rate) - self._told(new["goal_position"], led, rate)
         values = [
             error,
-            np.where(unknown, np.nan, way),
-            position,
-            np.where(unknown, np.nan, speed),
-            np.where(unknown, np.nan, np.abs(cycles["effort"])),
-            np.where(hurries, 0.0, np.abs(error)),
-            np.where(np.isnan(off), np.nan, swings),
-            np.where(unknown, np.nan, self._swings(cycles, cycles["goal_position"])),
+            way,
+            free,
+            speed,
+            np.abs(new["effort"]),
+            away,
+            swings,
+            self._swings(new["goal_position"], rate),
         ]
-        self.bins.bin_cycles(cycles["read_ns"], np.array(values))
-        self._trail.add_cycles(
-            cycles["read_ns"], way, np.where(driven, cycles["position"], np.nan), cycles["effort"]
-        )
+        for row, of in enumerate((unknown,) * 6 + (np.isnan(off), unknown)):
+            if of.any():
+                values[row] = np.where(of, np.nan, values[row])
+        self.bins.bin_cycles(new["read_ns"], values)
+        self._trail.add_cycles(new["read_ns"], way.T, free.T, new["effort"].T)
 
-    def _sought(self, cycles: NDArray[np.void]) -> Floats:
+    def _add_positions(self, at_ns: NDArray[np.int64], position: Floats, kept: NDArray[np.bool_]) -> None:
+        """Add positions of all joints with their times, without those that are not `kept`: shape (joints,
+        cycles)."""
+        for row, joint in enumerate(self._joints):
+            mine = slice(None) if kept[row].all() else kept[row]
+            self._jumps[row].add_positions(joint, at_ns[row, mine], position[row, mine])
+
+    def _hurries(self, velocity: Floats, error: Floats, moved: Floats) -> NDArray[np.bool_] | None:
+        """Return where a joint approaches its goal at full speed, and is thus not at fault for its error;
+        None if nowhere."""
+        quick, before = np.abs(velocity), self._fastest[:, None]
+        self._fastest = np.maximum(self._fastest, quick.max(axis=1))
+        top = np.array([[_SLOWEST_TOP * (joint.logged.top_speed or 0)] for joint in self._joints])
+        if not (quick >= _FULL_SPEED * np.maximum(before, top)).any():
+            return None
+        fastest = np.maximum(np.maximum.accumulate(np.hstack([before, quick]), axis=1)[:, 1:], top)
+        hurries: NDArray[np.bool_] = (velocity * error < 0) & (quick >= _FULL_SPEED * fastest)
+        hurries &= moved >= _FULL_SPEED / 2 * quick
+        return hurries
+
+    def _sought(self, columns: JointColumns, by_effort: NDArray[np.bool_], known: int) -> Floats:
         """Return the reference position of each joint while a controller moves it with an effort, NaN
-        otherwise; shape (cycles, joints)."""
-        sought = np.full(cycles["position"].shape, np.nan)
-        by_effort = (cycles["torque"] == Torque.ON) & cycles["valid"] & np.isfinite(cycles["goal_effort"])
+        otherwise; shape (joints, cycles)."""
+        sought = np.full(by_effort.shape, np.nan)
         for row, column in self._references.items():
-            sought[:, row] = np.where(by_effort[:, row], cycles["reference"][:, column], np.nan)
+            sought[row] = np.where(by_effort[row], columns["reference"][column, known:], np.nan)
         return sought
 
-    def _swings(self, cycles: NDArray[np.void], values: Floats) -> Floats:
-        """Return an array (cycles, joints) that has the cycle rate in 1/s where a swing of `values` ends,
+    def _swings(self, values: Floats, rate: float) -> Floats:
+        """Return an array (joints, cycles) that has the cycle rate in 1/s where a swing of `values` ends,
         and 0 elsewhere. Its mean is the number of swings a second."""
         found = np.zeros_like(values)
-        rate = 1e9 / max(float(np.median(np.diff(cycles["read_ns"]))), 1.0) if len(cycles) > 2 else 0.0
-        for row, joint in enumerate(self._joints):
-            known = np.flatnonzero(np.isfinite(values[:, row]))
-            mine = values[known, row]
+        least = np.array([_SWING_RAD * joint.share for joint in self._joints])
+        # Most joints move less than the smallest swing in a slice
+        extent = np.fmax.reduce(values, axis=1) - np.fmin.reduce(values, axis=1)
+        for row in np.flatnonzero(~(extent < least)).tolist():
+            known = np.flatnonzero(np.isfinite(values[row]))
+            mine = values[row, known]
             new = np.flatnonzero(np.diff(mine, prepend=math.nan) != 0)  # Goals are constant between commands
             steps = np.diff(mine[new])
             turns = new[np.flatnonzero(steps[1:] * steps[:-1] < 0) + 1]
-            far = np.abs(np.diff(mine[turns])) >= _SWING_RAD * joint.share
+            far = np.abs(np.diff(mine[turns])) >= least[row]
             # Only swings without missing cycles in between count.
             swings = turns[1:][far & (np.diff(known[turns]) == np.diff(turns))]
-            found[known[swings], row] = rate
+            found[row, known[swings]] = rate
         return found
 
-    def _told(self, cycles: NDArray[np.void], way: Floats) -> Floats:
+    def _told(self, goal: Floats, way: Floats, rate: float) -> Floats:
         """Return an array as of `_swings` for commanded swings: those of the trajectory, and steps of a
         goal that was constant before, which count as two."""
-        steps = np.abs(np.diff(cycles["goal_position"], axis=0, prepend=np.nan))
-        begins = steps >= _SWING_RAD * np.array([joint.share for joint in self._joints])
-        begins[1:] &= steps[:-1] == 0.0
-        rate = 1e9 / max(float(np.median(np.diff(cycles["read_ns"]))), 1.0) if len(cycles) > 2 else 0.0
-        return np.maximum(self._swings(cycles, way), np.where(begins, 2.0 * rate, 0.0))
+        found = self._swings(way, rate)
+        steps = np.abs(np.diff(goal, prepend=np.nan))
+        begins = steps >= np.array([[_SWING_RAD * joint.share] for joint in self._joints])
+        if begins.any():
+            begins[:, 1:] &= steps[:, :-1] == 0.0
+            found = np.maximum(found, np.where(begins, 2.0 * rate, 0.0))
+        return found
 
     def findings(self, reached_off: Mapping[str, float] = _NONE) -> Iterable[Finding]:
         """Report joints that stand still, oscillate, or follow worse than before, and positions that jumped.

@@ -42,7 +42,7 @@ class Trail:
         slots = np.floor(since_s / STEP_S + 1e-6)
         first = np.diff(slots, prepend=self._slot) > 0
         self._slot = slots[-1]
-        new = np.column_stack([since_s, way, position, load])[first]
+        new = np.column_stack([since_s[first], way[first], position[first], load[first]])
         self._rows = np.vstack([self._rows, new])
         if len(self._rows) > _MOST:
             half = _MOST // 2
