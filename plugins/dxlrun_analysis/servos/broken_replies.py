@@ -48,8 +48,9 @@ class BrokenReplies:
         self._cut += np.bincount(cut, minlength=buses * IDS)
         self._noisy += np.bincount(exchanges.bus[(exchanges.noise > 0) & exchanges.ended], minlength=buses)
         # In an incomplete fast status packet, stray bytes are cut blocks.
-        cut_blocks = exchanges.requests.fast[exchanges.request]
-        cut_blocks[np.setdiff1d(np.arange(len(cut_blocks)), due.exchange[due.reply < 0])] = False
+        incomplete = np.zeros(len(exchanges.request), np.bool_)
+        incomplete[due.exchange[due.reply < 0]] = True
+        cut_blocks = exchanges.requests.fast[exchanges.request] & incomplete
         disturbed = (exchanges.noise > 0) & ~cut_blocks
         self._disturbed += np.bincount(exchanges.bus[disturbed], minlength=buses)
         self._asked += np.bincount(exchanges.bus[exchanges.request > 0], minlength=buses)

@@ -267,7 +267,7 @@ class Pairing:
             pieces = [(row, np.zeros(len(row), np.int64), servo_id, error)]
             pieces += self._blocks(status, np.flatnonzero(joint), request[of])
             row, number, servo_id, error = (np.concatenate(column) for column in zip(*pieces, strict=True))
-            order = np.lexsort((number, row))
+            order = np.argsort(row * IDS + number, kind="stable")
             row, servo_id, error = row[order], servo_id[order], error[order]
         place = self._requests.all.places[request[of[row]], servo_id]
         return Replies(

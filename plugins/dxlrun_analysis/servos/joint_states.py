@@ -88,11 +88,10 @@ class JointStates:
         known = np.isfinite(found) & usable[:end, None]
         steps = np.floor(np.where(known, found, 0.0) / _STEPS[:, None]).astype(np.int64)
         bins = np.where(known, np.clip(steps - _FIRST[:, None], 0, BINS - 1), -1)
-        for joint in range(len(self.share)):
-            for quantity in QUANTITIES:
-                mine = bins[:, quantity, joint]
-                spent = np.bincount(mine[mine >= 0], period_ns[:end][mine >= 0], BINS)
-                self.time_ns[joint, quantity] += spent.astype(np.int64)
+        joints, _, count = shape = (*self.time_ns.shape[:2], BINS + 1)  # Bin -1 is counted, too, and dropped
+        first = (np.arange(len(QUANTITIES))[:, None] + len(QUANTITIES) * np.arange(joints)) * count + 1
+        spent = np.bincount((bins + first).ravel(), np.repeat(period_ns[:end], first.size), math.prod(shape))
+        self.time_ns += spent.astype(np.int64).reshape(shape)[:, :, 1:]
         return Places(numbers[:end], bins)
 
     def range_text(self, joint: int, quantity: int, low: int, high: int) -> str:

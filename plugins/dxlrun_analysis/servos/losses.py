@@ -385,7 +385,7 @@ def _moments(exchanges: Exchanges) -> Numbers:
 def _before(group: Numbers, came: Flags, so_far: Numbers) -> Numbers:
     """Return, for each due reply, how many replies of the same group (bus or servo) came before it, and
     add the new ones to the totals in `so_far`."""
-    order = np.argsort(group, kind="stable")
+    order = np.argsort(group.astype(np.uint16), kind="stable")  # 16 bits are sorted without comparisons
     count = np.cumsum(came[order])
     begins = np.flatnonzero(np.diff(group[order], prepend=-1))
     earlier: Numbers = np.repeat(count[begins] - came[order][begins], np.diff(np.append(begins, len(order))))

@@ -86,7 +86,8 @@ class ReplyTimes:
         of, servo = late.exchange[rows], late.servo[rows]
         self._given_up += np.bincount(servo, minlength=len(self._given_up))
         begun_ns = exchanges.sent_ns.copy()
-        np.maximum.at(begun_ns, replies.exchange[replies.answers], replies.last_ns[replies.answers])
+        if len(rows):
+            np.maximum.at(begun_ns, replies.exchange[replies.answers], replies.last_ns[replies.answers])
         behind = requests.places[exchanges.request[of], servo % IDS] > 0
         alone = np.flatnonzero(servo % IDS != BROADCAST_ID)
         kind = np.where(behind, _CHAINED, kinds[of])[alone]
@@ -205,6 +206,8 @@ def _in_time(exchanges: Exchanges) -> Flags:
     They were given up for another reason, such as lost bytes before them.
     """
     replies, late = exchanges.replies, exchanges.late
+    if not len(late.exchange):
+        return np.zeros(0, np.bool_)
     of = replies.exchange[replies.answers]
     longest_ns = np.zeros(len(exchanges.requests.kinds), np.int64)
     took_ns = replies.last_ns[replies.answers] - exchanges.sent_ns[of]

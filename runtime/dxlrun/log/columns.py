@@ -80,8 +80,10 @@ class PacketColumns(Sequence[LoggedPacket]):
 
     def byte(self, index: int) -> NDArray[np.uint8]:
         """Return the byte at one offset of each packet, shape (packets,); 0 where a packet is too short."""
-        found = np.zeros(len(self), np.uint8)
         there = index < self.length
+        if there.all():
+            return self.data[self.start + index]
+        found = np.zeros(len(self), np.uint8)
         found[there] = self.data[self.start[there] + index]
         return found
 
