@@ -36,8 +36,18 @@ from dxlrun import (
 )
 from dxlrun.tooling.robots import FrameTree, read_urdf
 from dxlrun_space.chain import BASE, IDENTITY, Chain, Pose, Vector, WrongChain, rotation_of, turned
-from dxlrun_space.path import MotionLimits, NoPath, Path, Planning, Positions, plan_joints, plan_line, shifted
-from dxlrun_space.solver import FULL, Solution, Solver, distance, residual_of
+from dxlrun_space.path import (
+    MotionLimits,
+    NoPath,
+    Path,
+    Planning,
+    Positions,
+    plan_joints,
+    plan_line,
+    plan_positions,
+    shifted,
+)
+from dxlrun_space.solver import FULL, Solver, distance, finish_search, residual_of
 from dxlrun_space.space_goals import (
     POSES,
     TWISTS,
@@ -413,16 +423,14 @@ class CartesianController(Controller[CartesianParameters]):
         except (LookupError, ValueError) as error:
             return NoPath(str(error))
         solver, exact = self._solver, self._exact and asked.asks_orientation
+        at, limits = self._at, self._limits
         if asked.positions:
             self._target = self._chain.pose(asked.positions)
+            planning = plan_positions(solver, at, asked.positions, self._target, limits)
         else:
-            self._target = asked.target(frame, self._chain.pose(self._at))
-        if asked.by_line:
-            planning = plan_line(solver, self._at, self._target, self._limits, exact=exact)
-        else:
-            planning = plan_joints(
-                solver, self._at, self._target, self._limits, exact=exact, near=asked.positions
-            )
+            self._target = asked.target(frame, self._chain.pose(at))
+            plan = plan_line if asked.by_line else plan_joints
+            planning = plan(solver, at, self._target, limits, exact=exact)
         found: Path | NoPath | None = None
         while found is None:
             for _ in range(self._steps):
@@ -534,14 +542,9 @@ class CartesianController(Controller[CartesianParameters]):
             begin, (a * period_s, b * period_s, c * period_s), (u * period_s, v * period_s, w * period_s)
         )
         sought = self._sought or self._at
-        search = self._solver.search_from(
-            self._followed, sought, exact=self._exact, steps=self._steps // 2 + 2
+        found = finish_search(
+            self._solver.search_from(self._followed, sought, exact=self._exact, steps=self._steps // 2 + 2)
         )
-        try:
-            while True:
-                next(search)
-        except StopIteration as done:
-            found: Solution = done.value
         if (left := found.residual.position) > LEASH_M:
             way, _ = distance(self._followed, self._chain.pose(found.positions))
             share = 1 - LEASH_M / left

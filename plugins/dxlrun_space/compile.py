@@ -12,7 +12,7 @@ from dxlrun_space import form
 from dxlrun_space.chain import BASE, Chain, WrongChain
 from dxlrun_space.path import out_of_reach, suffices
 from dxlrun_space.reach import dexterity
-from dxlrun_space.solver import FULL, Search, Solution, Solver
+from dxlrun_space.solver import FULL, Solver, finish_search
 from dxlrun_space.space_goals import PoseCommand
 
 _GOAL: Final = {"x", "y", "z", "rpy", "quaternion"}
@@ -73,7 +73,7 @@ def _solved(compilation: Compilation, chain: Chain, pose: form.TipPose) -> Row |
         if goal.asks_orientation
         else solver.search_place(target, start)
     )
-    found = _finished(search)
+    found = finish_search(search)
     if not suffices(found.residual, exact):
         raise WrongChain(
             "", out_of_reach(found.residual, exact), "move the pose, or give it another orientation"
@@ -89,15 +89,6 @@ def _solved(compilation: Compilation, chain: Chain, pose: form.TipPose) -> Row |
         "margin_joint": chain.joints[least],
         "margin_unit": plans[least].unit.si,
     }
-
-
-def _finished(search: Search) -> Solution:
-    while True:
-        try:
-            next(search)
-        except StopIteration as done:
-            found: Solution = done.value
-            return found
 
 
 STAGE = CompileStage(compile_tip_poses)

@@ -36,6 +36,8 @@ _LEASH_RAD: Final = 0.05
 _SHARE: Final = 0.5
 """Part of a joint's acceleration limit for each of two terms: the path's curvature, and changes of speed."""
 _LEAST: Final = 1e-9
+_ROUNDING: Final = 1e-6
+"""Largest distance of a position from a limit in other digits of the same angle, rad or m."""
 
 
 class MotionLimits(msgspec.Struct, frozen=True):
@@ -146,17 +148,27 @@ Planning = Generator[None, None, Path | NoPath]
 
 
 def plan_joints(
-    solver: Solver, start: Positions, target: Pose, limits: MotionLimits, *, exact: bool, near: Positions = ()
+    solver: Solver, start: Positions, target: Pose, limits: MotionLimits, *, exact: bool
 ) -> Planning:
-    """Plan a motion in which all joints turn evenly from the start to a solution `near` others."""
-    found = yield from solver.search(target, near or start, exact=exact)
+    """Plan a motion in which all joints turn evenly from the start to the pose."""
+    found = yield from solver.search(target, start, exact=exact)
     if not suffices(found.residual, exact):
         return NoPath(out_of_reach(found.residual, exact))
-    ways = [b - a for a, b in zip(start, found.positions, strict=True)]
+    return (yield from plan_positions(solver, start, found.positions, target, limits))
+
+
+def plan_positions(
+    solver: Solver, start: Positions, goal: Positions, target: Pose, limits: MotionLimits
+) -> Planning:
+    """Plan a motion in which all joints turn evenly from the start to goal positions."""
+    for joint, at, low, high in zip(solver.chain.joints, goal, solver.lower, solver.upper, strict=True):
+        if not low - _ROUNDING <= at <= high + _ROUNDING:
+            return NoPath(f"the pose has {joint} outside its limits")
+    ways = [b - a for a, b in zip(start, goal, strict=True)]
     count = _count(max(map(abs, ways)) / _NODE_RAD)
     places = [index / count for index in range(count + 1)]
     nodes = [tuple(a + place * way for a, way in zip(start, ways, strict=True)) for place in places[:-1]]
-    return (yield from _timed(solver, places, [*nodes, found.positions], target, limits))
+    return (yield from _timed(solver, places, [*nodes, goal], target, limits))
 
 
 def plan_line(

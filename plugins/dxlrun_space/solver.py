@@ -84,6 +84,16 @@ Search = Generator[None, None, Solution]
 """Search for a solution, which it returns: each `next` makes one step."""
 
 
+def finish_search(search: Search) -> Solution:
+    """Make all steps of a search, and return its solution."""
+    while True:
+        try:
+            next(search)
+        except StopIteration as done:
+            found: Solution = done.value
+            return found
+
+
 def distance(pose: Pose, target: Pose) -> tuple[Vector, Vector]:
     """Return the way from a pose to its target: translation, m, and rotation vector, rad, in the base."""
     (x, y, z), (u, v, w) = pose[1], target[1]

@@ -113,7 +113,7 @@ class PoseCommand(CommandModel):
             (self.dx or 0.0, self.dy or 0.0, self.dz or 0.0),
             rotation,
             from_rpy(self.drpy or (0.0, 0.0, 0.0)),
-            self.path == "line" and self.pose is None,
+            self.path == "line",
             math.nan if self.seconds is None else self.seconds,
             self.frame,
             tuple(self.pose[joint] for joint in joints) if self.pose else (),
@@ -155,7 +155,7 @@ class PoseGoal(msgspec.Struct, frozen=True, array_like=True):
     @property
     def asks_orientation(self) -> bool:
         """True if the goal has an orientation, absolute or relative."""
-        return bool(self.positions) or self.rotation is not None or self.turn[3] != 1.0
+        return self.rotation is not None or self.turn[3] != 1.0
 
     def target(self, frame: Pose, tip: Pose) -> Pose:
         """Return the goal pose in the base from the poses of the frame and of the tip at the start."""

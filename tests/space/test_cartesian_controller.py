@@ -140,14 +140,18 @@ def test_what_cannot_be_is_refused_before_a_joint_moves(pose: dict[str, Any], te
     assert (stage.goal.ended[0][0], stage.goal.ended[0][1][: len(text)]) == ("aborted", text)
 
 
-def test_a_named_pose_is_reached_by_its_own_joints() -> None:
-    arm, chance = all_arms()["six"], random.Random(3)
+@pytest.mark.parametrize(("name", "keys"), [("six", {}), ("seven", {"posture": {"j0": "30 deg"}})])
+def test_a_named_pose_is_reached_by_its_own_joints(name: str, keys: dict[str, Any]) -> None:
+    arm, chance = all_arms()[name], random.Random(3)
     for _ in range(5):
-        stage, positions = staged("six", arm.drawn(chance)), arm.drawn(chance)
+        stage, positions = staged(name, arm.drawn(chance), **keys), arm.drawn(chance)
         named = dict(zip(arm.joints, positions, strict=True))
         stage.send(0.0, "pose", pose={**named, "gripper": 0.0})
-        assert played(stage, 9.0)[-1] == pytest.approx(positions, abs=1e-4)
+        assert played(stage, 9.0)[-1] == pytest.approx(positions, abs=1e-9)
         assert stage.goal.ended[0][0] == "reached"
+    stage.send(None, "pose", pose={**named, arm.joints[1]: 99.0})
+    assert played(stage, 1.0)[-1] == pytest.approx(positions, abs=1e-9)
+    assert stage.goal.ended[0][:2] == ("aborted", f"the pose has {arm.joints[1]} outside its limits")
     with pytest.raises(ValueError, match="the pose has no position of "):
         stage.prepare("pose", pose={arm.joints[2]: 0.1})
 

@@ -84,7 +84,7 @@ def omit_joints(grown: PlainDocument, without: Sequence[str]) -> Omission:
         (*out, *(name for name in groups if name not in left)),
         (remark,),
         tuple(at for at in remover.uneven if str(at[1]) in _mapping(reduced.data.get(_CONTROLLERS))),
-        tuple(remover.poses),
+        tuple(sorted(remover.poses)),
     )
 
 
