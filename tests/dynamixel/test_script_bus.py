@@ -335,7 +335,10 @@ def test_states_belong_to_the_caller(script):
     for array in (after.position, after.valid, after.alert):
         array[:] = 0
     assert (read().position > 0).all()
-    assert (read().valid.all(), read().alert.tolist()) == (True, [False, False, True])
+    last = read()
+    assert (last.valid.all(), last.alert.tolist()) == (True, [False, False, True])
+    script.simulated.servos[2].silence()
+    assert (read().valid.tolist(), last.valid.all()) == ([True, True, False], True)
 
 
 def test_states_are_copied_and_errors_pickled(script):
@@ -569,9 +572,11 @@ def test_without_the_kernel_the_sdk_does_the_same(monkeypatch, servos, protocol)
             found.writer("goal_position", "led")(before.position, [np.nan, 1, 1])
             assert found.read("led").tolist() == [0, 1, 1]
             assert read().goal_position[0] == state.goal_position[0]
+            served.inject("overload servo=3")
             served.inject("silence servo=2")
             state = read()
             assert state.valid.tolist() == [True, False, True]
+            assert (before.alert.any(), state.alert.tolist()) == (False, [False, False, True])
             assert state.age[1] > state.age[2]
             with pytest.raises(ServoError, match=r"ID 2 on .* did not answer"):
                 found.read("present_temperature")
