@@ -29,7 +29,12 @@ from dxlrun.compile.controller_entry import (
 from dxlrun.compile.controller_graph import ControllerGraph, Mistake
 from dxlrun.compile.joints.limits import LimitViolation, beyond_limits
 from dxlrun.compile.motions import TRAJECTORY
-from dxlrun.control.controllers.plugin_loading import ControllerClass, PlugIns, robot_model
+from dxlrun.control.controllers.plugin_loading import (
+    ControllerClass,
+    PlugIns,
+    load_plugins,
+    robot_model,
+)
 from dxlrun.control.controllers.update_order import rate_divider, rate_fits
 from dxlrun.description.base_form import Name, ParametersModel
 from dxlrun.description.form_problems import sentences_of
@@ -46,6 +51,7 @@ from dxlrun.description.units import (
 )
 from dxlrun.errors import suggestion, what_and_fix
 from dxlrun.plan.loop_plan import ControllerPlan, JointPlan, ServoLimit, SourcePlan
+from dxlrun.plan.robot_plan import Plan
 from dxlrun.remote import texts
 from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
 
@@ -205,6 +211,13 @@ class Preparation:
     """Cache of `known`, by controller name; not used when a controller of that name has another plan now."""
     _schemas: dict[str, dict[str, object]] = field(default_factory=dict, init=False)
     """Cache of `takes`: controller type -> command -> JSON Schema."""
+
+    @classmethod
+    def from_plan(cls, plan: Plan) -> Preparation:
+        """Return the preparation of a robot's commands by its plan and the installed plug-ins."""
+        loop, plugins = plan.loop, load_plugins(files=plan.included)
+        joints = {joint.name: joint for joint in loop.joints}
+        return cls(joints, plugins, loop.sources, plan.urdf, plan.groups, plan.omitted, plan.poses)
 
     def take_servo_limits(self, joint: str, limits: tuple[ServoLimit, ...]) -> None:
         """Store the registers that limit a joint's servo, so that commands are checked against them."""

@@ -31,7 +31,6 @@ from uvicorn.server import ServerState
 
 from dxlrun.channels import child_processes
 from dxlrun.channels.child_processes import Failed, Finish, Listening, MessageChannel
-from dxlrun.control.controllers.plugin_loading import load_plugins
 from dxlrun.errors import DxlrunError
 from dxlrun.plan.robot_plan import Plan, from_json
 from dxlrun.remote.computation import PR_SET_PDEATHSIG
@@ -71,12 +70,7 @@ def main() -> None:
     plan: Plan = from_json(child_processes.whole(job.plan))
     try:
         link = Link(plan, job.memory, job.epoch_offset_ns)
-        joints = {joint.name: joint for joint in plan.loop.joints}
-        plugins = load_plugins(files=plan.included)
-        preparation = Preparation(
-            joints, plugins, plan.loop.sources, plan.urdf, plan.groups, plan.omitted, plan.poses
-        )
-        gateway = GatewayApp(link, preparation, job.log)
+        gateway = GatewayApp(link, Preparation.from_plan(plan), job.log)
         network = Listener.secured(Address.parse(job.listen, plan.robot)) if job.listen else None
         listener, path = create_listener(plan.robot)
     except (DxlrunError, OSError) as error:

@@ -24,7 +24,6 @@ from dxlrun.channels.mailbox import Mailbox
 from dxlrun.channels.ring import Payload, RecordKind, RingWriter
 from dxlrun.channels.tagged import decode
 from dxlrun.channels.topic_messages import LEAST_CAPACITY, LONGEST_RECORD, OpenedTopic, TopicRecord
-from dxlrun.control.controllers.plugin_loading import load_plugins
 from dxlrun.errors import RunGone
 from dxlrun.plan.robot_plan import Plan
 from dxlrun.remote.gateway import GatewayApp
@@ -85,11 +84,7 @@ class VirtualLink:
         self.gateways_link = Link(plan, memory)
         for descriptor in astuple(memory):
             os.close(descriptor)
-        joints = {joint.name: joint for joint in loop.joints}
-        plugins = load_plugins(files=plan.included)
-        preparation = Preparation(
-            joints, plugins, loop.sources, plan.urdf, plan.groups, plan.omitted, plan.poses
-        )
+        preparation = Preparation.from_plan(plan)
         log_path = str(log) if log else None
         # One second per request, so that no rate limit applies.
         seconds = itertools.count()
