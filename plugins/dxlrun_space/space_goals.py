@@ -101,7 +101,7 @@ class PoseCommand(CommandModel):
     def as_goal(self, joints: Sequence[str] = ()) -> PoseGoal:
         """Return the pose for the loop; raise ValueError if a pose by name lacks one of the joints."""
         if self.pose is not None and (lacking := [each for each in joints if each not in self.pose]):
-            raise ValueError(f"the pose has no position of {', '.join(lacking)}")
+            raise ValueError(f"the pose has no position of {', '.join(lacking)}; name a pose of this arm")
         x, y, z = (math.nan if each is None else each for each in (self.x, self.y, self.z))
         rotation = None if self.rpy is None else from_rpy(self.rpy)
         if self.quaternion is not None:
