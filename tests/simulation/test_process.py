@@ -248,6 +248,11 @@ def test_an_unplugged_adapter_hangs_up_and_comes_back_under_another_name(tmp_pat
             assert after not in ("", before)
             assert os.readlink(link) == after
             pings(str(link))
+        assert "fault" in process.ask(fault="unplug bus=main packet=1")
+        with opened(str(link)) as port:
+            os.write(port, bytes.fromhex("ff ff 09 02 01 f3"))  # A ping that no servo answers
+            while process.next() != {"ports": {**process.ports, "main": ""}}:
+                pass
         process.hang_up()
     assert not link.is_symlink()
 

@@ -1797,18 +1797,11 @@ static void watch(const Server *s, int32_t index, int operation)
     epoll_ctl(s->waiting, operation, s->terminals[index]->descriptor, &event);
 }
 
-static void deliver(Server *s, Terminal *t, int64_t now_ns)
-{
-    line_deliver(t, now_ns);
-    if (changed(t))
-        s->news |= ADAPTER;
-}
-
 static void receive_from(Server *s, int32_t index, int64_t now_ns)
 {
     Terminal *t = s->terminals[index];
     if (line_next_due(t->bus) <= now_ns)
-        deliver(s, t, now_ns);
+        line_deliver(t, now_ns);
     if (!t->plugged || changed(t))
         return;
     int32_t more = t->size == CHUNK, count = line_accept(t, now_ns);
@@ -1872,7 +1865,7 @@ static void serve_event(Server *s)
     /* Replies that were due before the host wrote go out first, because the host could have read them. */
     for (int32_t i = 0; i < s->count; i++)
         if (s->terminals[i]->due_ns <= now_ns)
-            deliver(s, s->terminals[i], now_ns);
+            line_deliver(s->terminals[i], now_ns);
     for (int32_t rounds = s->count, any = 1; any;) { /* a host that drives all buses writes to them in one go */
         any = 0;
         for (int32_t i = 0; i < s->count; i++)
@@ -1945,7 +1938,7 @@ int32_t line_serve(Server *s)
     int32_t news = s->news;
     s->news = 0;
     for (int32_t i = 0; i < s->count; i++)
-        news |= s->terminals[i]->bus->line.raised ? RAISED : 0;
+        news |= (s->terminals[i]->bus->line.raised ? RAISED : 0) | (changed(s->terminals[i]) ? ADAPTER : 0);
     return news;
 }
 
