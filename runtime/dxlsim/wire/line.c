@@ -92,11 +92,12 @@ typedef struct { /* one servo or device, as the line sees it */
     int32_t least_entries; /* shortest list of a group read that it answers */
     int32_t goal_count;
     const Goal *goals;
-    void (*show)(void *shaft, int64_t now_ns, int32_t address, int32_t length); /* writes the motion into `memory`: */
+    /* Writes the motion into `memory`: motion_show of mechanics.c; NULL: Python sets registers before they are read */
+    void (*show)(void *shaft, int64_t now_ns, int32_t address, int32_t length);
     /* Follows goals that only change a trajectory: motion_take_goal of mechanics.c; returns 0: Python follows them */
     int32_t (*take_goal)(void *shaft, int64_t now_ns);
     int64_t aims;          /* bits of these goals; 0: Python follows all goals */
-    void *shaft;           /* motion_show of mechanics.c; NULL: Python sets registers before they are read */
+    void *shaft;
 } Node;
 
 typedef struct { /* entries of simulated buses, which Python takes in batches */
@@ -1631,7 +1632,7 @@ int32_t line_port_receive(Ports *p, int32_t line, uint8_t *data, int32_t room) {
 
 int32_t line_port_wait(Ports *p, int64_t deadline_ns, uint8_t *ready) { return ports_wait(p, deadline_ns, ready); }
 
-/* Real time: pseudo-terminals of lines that hosts open, served together */
+/* Real time: pseudo-terminals of lines that hosts open, or sockets in their place, served together */
 
 #ifdef __linux__
 
