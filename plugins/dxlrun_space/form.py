@@ -10,6 +10,7 @@ from dxlrun import Angle, Length
 from dxlrun.tooling.features import Section
 from dxlrun.tooling.files import Form, Name, key
 
+_Place = Annotated[Length, Field(ge=-100, le=100)]  # As in the command `pose`
 _Turns = Annotated[tuple[Angle, Angle, Angle], Field(strict=False)]
 _Quaternion = Annotated[tuple[float, float, float, float], Field(strict=False)]
 
@@ -19,9 +20,9 @@ class TipPose(Form):
 
     tip: str = key("Link of the URDF that has the pose.", "gripper_link", min_length=1)
     base: str = key("Link above the tip in whose axes the pose is; empty: the root.", "base_link", "")
-    x: Length = key("Position of the tip.", "20 cm")
-    y: Length = key("Position of the tip.", "0 cm")
-    z: Length = key("Position of the tip.", "15 cm")
+    x: _Place = key("Position of the tip.", "20 cm")
+    y: _Place = key("Position of the tip.", "0 cm")
+    z: _Place = key("Position of the tip.", "15 cm")
     rpy: _Turns | None = key(
         "Roll, pitch and yaw. Without it any orientation.", "[0 deg, 40 deg, 0 deg]", None
     )

@@ -29,7 +29,9 @@ def _rad(value: object) -> object:
     if isinstance(value, str):
         value = 0.0 if value.strip() in ("0", "0.0") else TypeAdapter(Angle).validate_python(value)
     if isinstance(value, int | float) and abs(value) > 2 * math.pi:
-        raise ValueError(f"{value:g} rad is more than a turn; write the unit, such as {value:g}deg")
+        raise ValueError(
+            f"{value:g} rad is more than a turn; write at most a turn, with its unit, such as 90deg"
+        )
     return value
 
 
