@@ -47,6 +47,11 @@ def test_overruns_skip_periods_and_a_row_of_them_is_told_once(robot, work, cycle
     assert text.endswith(told)
 
 
+def test_a_stall_counts_as_five_periods(robot):
+    robot.run(work={1: 7.5}, end_ns=12 * PERIOD_NS)
+    assert robot.column("period_ns")[:4] == [PERIOD_NS, PERIOD_NS, 5 * PERIOD_NS, PERIOD_NS]
+
+
 def test_an_end_between_two_deadlines_runs_the_cycles_before_it(robot):
     assert robot.run(end_ns=3 * PERIOD_NS + 1).cycles == 4
 

@@ -93,7 +93,7 @@ class PseudoTerminal:
         is updated. Bytes that the host wrote in between are lost."""
         if self.state.opened == self.bus.times_unplugged and self.plugged == self.bus.plugged:
             return False
-        self.state.size = 0
+        self.state.held_ns = self.state.ready = self.state.size = self.state.known = 0
         if self.state.opened != self.bus.times_unplugged:
             self.state.opened = self.bus.times_unplugged
             old = self._master

@@ -129,7 +129,8 @@ class Server:
             for other in (stop, self._starter.fileno()):
                 if other >= 0:
                     self._library.line_watch(self._address, other)
-            self._plug()
+            for index in range(len(self._terminals)):
+                self._library.line_plug(self._address, index)
             self._tell(SimulationMessage(self._ports(), granted))
             while not self._stopped:
                 self._serve_once(stop)
@@ -153,18 +154,13 @@ class Server:
             for bus in self._buses:
                 bus.raise_stored()
         if news & _ADAPTER:
-            for terminal in self._terminals:
-                terminal.follow_adapter()
-            self._plug()
+            for index, terminal in enumerate(self._terminals):
+                if terminal.follow_adapter():
+                    self._library.line_plug(self._address, index)
             self._tell(SimulationMessage(self._ports()))
         if news & _ASKED:
             self._answer_requests(stop)
         self._ledger.flush_if_due(time.monotonic_ns())
-
-    def _plug(self) -> None:
-        """Wait for the terminals that exist now, after an adapter was unplugged or plugged in."""
-        for index in range(len(self._terminals)):
-            self._library.line_plug(self._address, index)
 
     def _ports(self) -> dict[str, str]:
         return {terminal.bus.name: terminal.path for terminal in self._terminals}

@@ -1946,12 +1946,8 @@ int32_t line_serve(Server *s)
 /* Begin to serve the device that a terminal has now. */
 void line_plug(Server *s, int32_t index)
 {
-    Terminal *t = s->terminals[index];
-    t->opened = t->bus->line.unplugged;
-    t->plugged = t->bus->line.plugged;
-    t->held_ns = t->ready = t->size = t->known = 0;
     watch(s, index, EPOLL_CTL_DEL); /* fails for a new device */
-    if (t->plugged)
+    if (s->terminals[index]->plugged)
         watch(s, index, EPOLL_CTL_ADD);
 }
 
