@@ -9,6 +9,7 @@ from tests.kit.browser import CHROMIUM, Browser
 from tests.kit.torso import Run
 from tests.view.served import Served
 
+from dxlrun.log import log_writer
 from dxlrun.testing import simulated_robot
 from dxlrun_view.live_robot import LiveRobot
 from dxlrun_view.recorded_robot import RecordedRobot
@@ -22,7 +23,9 @@ def log(tmp_path_factory):
     """The log of 12 s of the torso with an IMU, whose arms and head move."""
     path = tmp_path_factory.mktemp("run") / "run.mcap"
     play = [ROBOTS / "motions/three_parts.yaml"]
-    simulated_robot(ROBOTS / "bioloid_torso_imu.yaml", play=play, duration_s=12, log=path).run()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(log_writer, "CHUNK_BYTES", 1 << 14)  # so that it has many slices
+        simulated_robot(ROBOTS / "bioloid_torso_imu.yaml", play=play, duration_s=12, log=path).run()
     return path
 
 
