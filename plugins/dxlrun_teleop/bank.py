@@ -146,9 +146,10 @@ def banks_of(robot: RemoteRobot, targets: Sequence[str], axes: int) -> list[Bank
 
 
 def _follows(one: Row, info: Row) -> bool:
-    """Return True if a controller moves as other joints do, such as a leader_follower: it reads the age of
+    """Return True if a controller moves as other joints do, such as a leader_follower: it needs the age of
     their states."""
-    return not {f"{joint}/age" for joint in info["units"]}.isdisjoint(one["reads"])
+    needed = {*one["reads"]}.difference(one["optional"])
+    return not needed.isdisjoint(f"{joint}/age" for joint in info["units"])
 
 
 def _bank(robot: RemoteRobot, one: Row, info: Row) -> Bank | None:

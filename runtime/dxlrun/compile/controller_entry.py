@@ -211,6 +211,7 @@ def compile_entry(
         publishes=cls.publishes,
         reference=interfaces.reference,
         reads=interfaces.reads,
+        optional=interfaces.optional,
         provides=interfaces.provides,
         source_commands=interfaces.source_commands,
         takeovers=interfaces.takeovers,

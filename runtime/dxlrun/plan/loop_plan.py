@@ -314,6 +314,7 @@ class ControllerPlan(msgspec.Struct, frozen=True):
     """Interfaces that it exports for each of its joints, for controllers that are `into` this one."""
     reads: tuple[str, ...] = ()
     """Interfaces that it reads without a claim: `JOINT/position`, `CONTROLLER/JOINT/position`."""
+    optional: tuple[str, ...] = ()  # Names in `reads` that it can do without
     topics: tuple[str, ...] = ()  # Its own topics: `/arm/state`
     provides: tuple[str, ...] = ()  # States that it provides: `orientation.x`
     source_commands: tuple[str, ...] = msgspec.field(default=(), name=SOURCE_COMMANDS)

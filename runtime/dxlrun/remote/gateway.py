@@ -292,6 +292,7 @@ class GatewayApp:
             fallback=plan.fallback,
             reference=plan.reference,
             reads=plan.reads,
+            optional=plan.optional,
             takes=self._preparation.takes(plan),
             goals=tuple(self._preparation.goals(plan)),
             motions=self._preparation.motions(plan),

@@ -36,6 +36,8 @@ class ControllerInfo(msgspec.Struct, frozen=True):
     reference: tuple[str, ...]
     """References, inputs of this controller, that controllers above this one can command."""
     reads: tuple[str, ...]
+    optional: tuple[str, ...]
+    """Names in `reads` that the controller can do without."""
     takes: dict[str, object]
     """Command that clients can send -> JSON Schema of its fields."""
     goals: tuple[str, ...]
