@@ -171,7 +171,6 @@ def inputs_of_pictures(reader: Reader) -> dict[str, Inputs]:
     torso = robot_and_motion("bioloid_torso_imu", "three_parts")
     view: Inputs = {"page of dxlrun view": page_of_view}
     analysis, lab = "dxlrun_analysis", "dxlrun_lab"
-    gripper = "robots/urdf/open_manipulator_x.urdf"
     page = said_by(
         *(f"{analysis}.page.{part}" for part in ("report_page", "loop_plots", "joint_plots", "wake_up_plots"))
     )
@@ -191,9 +190,15 @@ def inputs_of_pictures(reader: Reader) -> dict[str, Inputs]:
         "lost": {"dxlrun analyze, of a silent servo": reader.lost},
         "fall": robot_and_motion("fall_reflex", "fall_reflex_tip"),
         "cycle": robot_and_motion("bioloid_torso", "three_parts"),
-        "reach": {
-            **{path: partial(file, path) for path in ("robots/open_manipulator_x.yaml", gripper)},
-            **said_by("dxlrun_space.reach"),
+        **{
+            name: {
+                **{
+                    f"robots/{one}": partial(file, f"robots/{one}")
+                    for one in (f"{arm}.yaml", f"urdf/{arm}.urdf")
+                },
+                **said_by("dxlrun_space.reach"),
+            }
+            for name, arm in (("reach", "open_manipulator_x"), ("reach_op3", "op3"))
         },
         "processes": {"drawing": drawn.processes},
         "motion": {"drawing": drawn.motion},

@@ -195,12 +195,10 @@ class Maker:
         printed(words, self.place)
         (self.into / "fall.svg").write_text(drawn.fall(self._log))
 
-    def reach(self) -> None:
-        """Draw where the gripper of an arm gets to."""
-        printed(
-            ("reach", "robots/open_manipulator_x_space.yaml", "end_effector_link", "reach.png"), self.place
-        )
-        self._kept("reach", base64.b64encode((self.place / "reach.png").read_bytes()).decode())
+    def reach(self, name: str, robot: str, link: str) -> None:
+        """Draw where a link of an arm gets to."""
+        printed(("reach", f"robots/{robot}.yaml", link, f"{name}.png"), self.place)
+        self._kept(name, base64.b64encode((self.place / f"{name}.png").read_bytes()).decode())
 
     def cycle(self) -> None:
         """Look into a cycle of the torso."""
@@ -299,6 +297,11 @@ class Maker:
             shown.convert("RGB").quantize(COLOURS * 2).save(self.into / f"{name}.png", optimize=True)
 
 
+REACHES = {
+    "reach": ("open_manipulator_x_space", "end_effector_link"),
+    "reach_op3": ("op3_space", "r_hand"),
+}
+"""Robot and link of each picture of what a link gets to."""
 DRAWINGS: dict[str, Callable[[], str]] = {
     "processes": drawn.processes,
     "motion": drawn.motion,
@@ -317,7 +320,7 @@ MADE: dict[str, Callable[[Maker], None]] = {
     "lost": Maker.lost,
     "fall": Maker.fall,
     "cycle": Maker.cycle,
-    "reach": Maker.reach,
+    **{name: partial(Maker.reach, name=name, robot=arm[0], link=arm[1]) for name, arm in REACHES.items()},
     "setup": Maker.setup,
     "calibrate": Maker.calibrate,
     "teach": Maker.teach,

@@ -34,8 +34,8 @@ from dxlrun import (
     ParametersModel,
     RobotModel,
 )
-from dxlrun.tooling.robots import FrameTree, read_urdf
-from dxlrun_space.chain import BASE, IDENTITY, Chain, Pose, Vector, WrongChain, rotation_of, turned
+from dxlrun.tooling.robots import FrameTree, Transform, read_urdf, rotated
+from dxlrun_space.chain import BASE, Chain, Vector, WrongChain, shifted
 from dxlrun_space.path import (
     MotionLimits,
     NoPath,
@@ -45,7 +45,6 @@ from dxlrun_space.path import (
     plan_joints,
     plan_line,
     plan_positions,
-    shifted,
 )
 from dxlrun_space.solver import FULL, Solver, distance, finish_search, residual_of
 from dxlrun_space.space_goals import (
@@ -64,10 +63,10 @@ ACCELERATION: Final = 20.0
 """Acceleration of joints without a limit, rad/s^2; an XM430 stops from its highest speed in 0.25 s."""
 SPEED: Final = 4.0
 """Speed of joints without a limit, rad/s: less than the slowest arm servo's at 12 V."""
-STEP_NS: Final = 500_000
-"""Period that pays for one step of planning: a step takes 0.06 ms, so planning takes 12 % of a cycle."""
+STEP_NS: Final = 300_000
+"""Period that pays for one step of planning: a step takes 0.05 ms, so planning takes 17 % of a cycle."""
 MOST_STEPS: Final = 50
-"""Most steps of a cycle, 3 ms."""
+"""Most steps of a cycle, 2.5 ms."""
 FEEDBACK_NS: Final = 100_000_000
 """Time between two feedback messages of a goal, ns."""
 LEASH_M: Final = 0.02
@@ -261,7 +260,7 @@ class CartesianController(Controller[CartesianParameters]):
         self._exact = parameters.orientation == "exact" or (
             parameters.orientation is None and len(context.joints) >= FULL
         )
-        self._stream = TwistMotion(self._chain, lower, upper, self._limits, exact=self._exact)
+        self._stream = TwistMotion(self._solver, self._limits, exact=self._exact)
         self._steps = min(MOST_STEPS, max(1, context.period_ns // STEP_NS))
         self._at: Positions = ()
         """Commanded positions, rad; empty while a joint has not answered yet."""
@@ -274,12 +273,12 @@ class CartesianController(Controller[CartesianParameters]):
         self._goal: Goal | None = None
         self._waiting: PoseGoal | None = None
         self._is_cancelled = False
-        self._target: Pose | None = None
+        self._target: Transform | None = None
         self._feedback_ns = self._commanded_ns = 0
         self._twist = NO_TWIST
         self._turns_with_tip = False
         self._is_held = self._is_ignoring = False
-        self._followed: Pose | None = None
+        self._followed: Transform | None = None
         """Pose that moves toward the leader's."""
         self._sought: Positions = ()
         """Positions of the followed pose, which the joints approach."""
@@ -325,7 +324,7 @@ class CartesianController(Controller[CartesianParameters]):
     def _follow(self, twist: TwistGoal, time_ns: int) -> None:
         self._turns_with_tip = twist.frame == self._chain.tip
         try:
-            rotation = IDENTITY if self._turns_with_tip else self._pose_of(twist.frame)[0]
+            rotation = (BASE if self._turns_with_tip else self._pose_of(twist.frame)).rotation
         except (LookupError, ValueError) as error:
             if not self._is_ignoring:
                 self.context.warn(f"twist ignored: {error}")
@@ -334,7 +333,7 @@ class CartesianController(Controller[CartesianParameters]):
         self._is_ignoring, self._commanded_ns = False, time_ns
         if self._goal is not None:
             self._end(Outcome.PREEMPTED, "replaced by a twist")
-        self._pass_to(None, (turned(rotation, twist.linear), turned(rotation, twist.angular)))
+        self._pass_to(None, (rotated(rotation, twist.linear), rotated(rotation, twist.angular)))
 
     def on_hold(self, time_ns: int) -> None:
         """Brake from the twist: the stream has ended."""
@@ -368,7 +367,7 @@ class CartesianController(Controller[CartesianParameters]):
         if goal is not None:
             goal.end(outcome, text)
 
-    def _pose_of(self, frame: str) -> Pose:
+    def _pose_of(self, frame: str) -> Transform:
         """Return the pose of a frame in the base. Raises LookupError or ValueError with what prevents it."""
         if not frame:
             return BASE
@@ -381,8 +380,7 @@ class CartesianController(Controller[CartesianParameters]):
             if silence := self._silence(index):
                 raise ValueError(f"no reply from {joint} {silence}, which moves frame {frame}")
             positions[joint] = float(self._position[index])
-        pose = self._frames.pose(frame, self._chain.base, positions)
-        return rotation_of(pose.rotation), pose.translation
+        return self._frames.pose(frame, self._chain.base, positions)
 
     def _silence(self, index: int) -> str:
         """Return for how long a joint that is read has not answered; empty if it answers."""
@@ -455,7 +453,7 @@ class CartesianController(Controller[CartesianParameters]):
             self._publish(_remark(found, asked), found.last, found.duration_s)
 
     def _publish(self, text: str, positions: Positions = (), seconds: float = math.nan) -> None:
-        x, y, z = (self._target or BASE)[1]
+        x, y, z = (self._target or BASE).translation
         last = np.array(positions or (math.nan,) * len(self.context.joints))
         self.context.publish("plan", PosePlan(x, y, z, last, seconds, text))
 
@@ -507,8 +505,8 @@ class CartesianController(Controller[CartesianParameters]):
                 self._twist = NO_TWIST
             linear, angular = self._twist
             if self._turns_with_tip:
-                rotation = self._chain.pose(self._at)[0]
-                linear, angular = turned(rotation, linear), turned(rotation, angular)
+                rotation = self._chain.pose(self._at).rotation
+                linear, angular = rotated(rotation, linear), rotated(rotation, angular)
             self._at = self._stream.advance_joints(self._at, linear, angular, self._period_s)
             held = self._stream.held_by
             self._report_hold("" if held < 0 else f"held: joint {self.context.joints[held]} is at its limit")
@@ -530,9 +528,9 @@ class CartesianController(Controller[CartesianParameters]):
         oldest = int(self._age.argmax())
         silence, leader = self._silence(oldest), self.parameters.leader
         if leader is not None and not silence:
-            rotation, place = chain.pose(self._position.tolist())
-            x, y, z = (leader.scale * a + b for a, b in zip(place, leader.offset, strict=True))
-            way, turn = distance(begin, (rotation, (x, y, z)))
+            lead = chain.pose(self._position.tolist())
+            x, y, z = (leader.scale * a + b for a, b in zip(lead.translation, leader.offset, strict=True))
+            way, turn = distance(begin, Transform((x, y, z), lead.rotation))
             linear = approach(way, self._limits.linear_acceleration, period_s)
             angular = approach(turn, self._limits.angular_acceleration, period_s)
         self._report_hold(silence and f"no reply from leader {chain.joints[oldest]} {silence}, holding")

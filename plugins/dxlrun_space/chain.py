@@ -11,21 +11,20 @@ from collections.abc import Sequence
 from typing import Final, TypeAlias
 
 import msgspec
+import numpy as np
 
-from dxlrun.tooling.robots import Urdf, UrdfJoint, from_rpy
+from dxlrun import Floats
+from dxlrun.tooling.robots import Transform, Urdf, UrdfJoint, from_rpy, product, rotated, rotation_about
 
 Vector: TypeAlias = tuple[float, float, float]
-Rotation: TypeAlias = "tuple[float, float, float, float, float, float, float, float, float]"
-"""Rotation matrix by columns: the x axis, the y axis, the z axis."""
 Quaternion: TypeAlias = tuple[float, float, float, float]
-Pose: TypeAlias = "tuple[Rotation, Vector]"
-Column: TypeAlias = "tuple[float, float, float, float, float, float]"
-"""Velocity of the link by one joint at unit speed: linear, then angular, in the axes of the base."""
+Column: TypeAlias = tuple[float, float, float, float, float, float]
+"""Velocity of the link by one joint at unit speed: linear, then angular times a lever, in the base's axes."""
 
-IDENTITY: Final[Rotation] = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
-BASE: Final[Pose] = (IDENTITY, (0.0, 0.0, 0.0))
+BASE: Final = Transform()
 """Pose of the base in itself."""
 _LEAST_SINE: Final = 1e-9
+_PRIMES: Final = (2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37, 41, 43, 47, 53)
 
 
 class WrongChain(ValueError):
@@ -37,10 +36,10 @@ class WrongChain(ValueError):
 
 
 class _JointStep(msgspec.Struct, frozen=True):
-    """One joint: the fixed pose of its frame, whose z axis is the joint's axis, in the frame before it."""
+    """One joint: its index in the positions, and its frame, whose z axis it has, in the one before it."""
 
-    rotation: Rotation
-    origin: Vector
+    index: int
+    fixed: Transform
     slides: bool
 
 
@@ -64,86 +63,54 @@ class Chain:
         ways = _ways(urdf, self.base, tip)
         self.joints = joints = tuple(joints) or tuple(joint.name for joint in ways if joint.moves)
         _check_joints(ways, joints)
-        order = {name: index for index, name in enumerate(joints)}
         steps: list[_JointStep] = []
-        rotation, origin = IDENTITY, (0.0, 0.0, 0.0)
-        self.order: list[int] = []
-        """Index in `joints` of each joint from the base on."""
-        back = IDENTITY
+        before = BASE
         for joint in ways:
-            fixed = compose((rotation, origin), (rotation_of(from_rpy(joint.rpy)), joint.xyz))
-            rotation, origin = fixed
-            if not joint.moves:
-                continue
-            onto = _onto(joint.axis)
-            steps.append(_JointStep(times(rotation, onto), origin, joint.type == "prismatic"))
-            self.order.append(order[joint.name])
-            back = inverted(onto)
-            rotation, origin = back, (0.0, 0.0, 0.0)
-        self._steps = tuple(steps)
-        self._end: Pose = rotation, origin
-        self.length = max(
-            0.01, sum(math.hypot(*each.origin) for each in steps[1:]) + math.hypot(*self._end[1])
-        )
+            before = before @ Transform(joint.xyz, from_rpy(joint.rpy))
+            if joint.moves:
+                onto = Transform(rotation=_onto(joint.axis))
+                steps.append(_JointStep(joints.index(joint.name), before @ onto, joint.type == "prismatic"))
+                before = onto.inverse
+        self._steps, self._end = tuple(steps), before
+        parts = *(step.fixed for step in steps[1:]), self._end
+        self.length = max(0.01, math.fsum(math.hypot(*part.translation) for part in parts))
         """Sum of the distances from the first joint to the tip, m: the scale of the arm."""
-        count = len(joints)
-        self._axes: list[Vector] = [(0.0, 0.0, 0.0)] * count
-        self._origins: list[Vector] = [(0.0, 0.0, 0.0)] * count
-        self._slides = [False] * count
-        for place, each in zip(self.order, steps, strict=True):
-            self._slides[place] = each.slides
+        self._axes = [BASE.translation] * len(joints)
+        self._origins = [BASE.translation] * len(joints)
+        self._tip_at = BASE.translation
+        self._slides = [slides for _, slides in sorted((step.index, step.slides) for step in steps)]
 
-    def pose(self, positions: Sequence[float]) -> Pose:
+    def pose(self, positions: Sequence[float]) -> Transform:
         """Return the pose of the tip in the base at joint positions, rad or m; `jacobian` refers to it."""
-        axes, origins = self._axes, self._origins
-        a, b, c, d, e, f, g, h, i = IDENTITY
-        x = y = z = 0.0
-        for place, step in zip(self.order, self._steps, strict=True):
-            u, v, w = step.origin
-            x += a * u + d * v + g * w
-            y += b * u + e * v + h * w
-            z += c * u + f * v + i * w
-            k, q, m, n, o, p, r, s, t = step.rotation
-            # The joint's frame in the base; its third column is the joint's axis.
-            a, b, c, d, e, f, g, h, i = (
-                a * k + d * q + g * m,
-                b * k + e * q + h * m,
-                c * k + f * q + i * m,
-                a * n + d * o + g * p,
-                b * n + e * o + h * p,
-                c * n + f * o + i * p,
-                a * r + d * s + g * t,
-                b * r + e * s + h * t,
-                c * r + f * s + i * t,
-            )
-            position = positions[place]
-            axes[place] = g, h, i
+        turn, (x, y, z) = BASE.rotation, BASE.translation
+        for step in self._steps:
+            u, v, w = rotated(turn, step.fixed.translation)
+            x, y, z = x + u, y + v, z + w
+            a, b, c, d = turn = product(turn, step.fixed.rotation)
+            position = positions[step.index]
+            # The joint turns about its z axis, or moves along it.
+            u, v, w = axis = 2 * (a * c + b * d), 2 * (b * c - a * d), 1 - 2 * (a * a + b * b)
             if step.slides:
-                x, y, z = x + g * position, y + h * position, z + i * position
+                x, y, z = x + u * position, y + v * position, z + w * position
             else:
-                sine, cosine = math.sin(position), math.cos(position)
-                a, b, c, d, e, f = (
-                    cosine * a + sine * d,
-                    cosine * b + sine * e,
-                    cosine * c + sine * f,
-                    cosine * d - sine * a,
-                    cosine * e - sine * b,
-                    cosine * f - sine * c,
+                sine, cosine = math.sin(position / 2), math.cos(position / 2)
+                turn = (
+                    a * cosine + b * sine,
+                    b * cosine - a * sine,
+                    c * cosine + d * sine,
+                    d * cosine - c * sine,
                 )
-            origins[place] = x, y, z
-        rotation, origin = compose(((a, b, c, d, e, f, g, h, i), (x, y, z)), self._end)
-        self._tip_at = origin
-        return rotation, origin
+            self._axes[step.index], self._origins[step.index] = axis, (x, y, z)
+        tip = Transform((x, y, z), turn) @ self._end
+        self._tip_at = tip.translation
+        return tip
 
-    def without_turns(self, positions: Sequence[float]) -> tuple[float, ...]:
-        """Return the positions with angles of at most half a turn, which have the same pose."""
-        return tuple(
-            each if slides else math.remainder(each, math.tau)
-            for each, slides in zip(positions, self._slides, strict=True)
-        )
+    def jacobian(self, lever: float = 1.0) -> list[Column]:
+        """Return a column per joint, in the order of `joints`, at the positions that `pose` got last.
 
-    def jacobian(self) -> list[Column]:
-        """Return a column per joint, in the order of `joints`, at the positions that `pose` got last."""
+        Args:
+            lever: Factor on angular velocities, m/rad, so that they compare with linear ones.
+        """
         x, y, z = self._tip_at
         columns: list[Column] = []
         for (a, b, c), (u, v, w), slides in zip(self._axes, self._origins, self._slides, strict=True):
@@ -151,8 +118,15 @@ class Chain:
                 columns.append((a, b, c, 0.0, 0.0, 0.0))
             else:
                 p, q, r = x - u, y - v, z - w
-                columns.append((b * r - c * q, c * p - a * r, a * q - b * p, a, b, c))
+                columns.append((b * r - c * q, c * p - a * r, a * q - b * p, a * lever, b * lever, c * lever))
         return columns
+
+    def without_turns(self, positions: Sequence[float]) -> tuple[float, ...]:
+        """Return the positions with angles of at most half a turn, which have the same pose."""
+        return tuple(
+            each if slides else math.remainder(each, math.tau)
+            for each, slides in zip(positions, self._slides, strict=True)
+        )
 
 
 def _ways(urdf: Urdf, base: str, tip: str) -> list[UrdfJoint]:
@@ -192,80 +166,41 @@ def _check_joints(ways: Sequence[UrdfJoint], joints: Sequence[str]) -> None:
             raise WrongChain("joints", what, f"remove it; the chain has {', '.join(names) or 'no joint'}")
 
 
-# Rotations
+# Positions and rotations
 
 
-def times(left: Rotation, right: Rotation) -> Rotation:
-    """Return the product of two rotations: `right` first, then `left`."""
-    return (*turned(left, right[:3]), *turned(left, right[3:6]), *turned(left, right[6:]))
+def spread(lower: Sequence[float], upper: Sequence[float], count: int) -> Floats:
+    """Return joint positions that are spread evenly over the limits, at most half a turn, one row each.
+
+    This is the sequence of R. D. Richtmyer (1951): multiples of square roots of primes, modulo 1.
+    """
+    low, high = np.clip((lower, upper), -math.pi, math.pi)
+    shares = np.arange(1, count + 1)[:, None] * np.sqrt(np.resize(_PRIMES, len(low))) % 1.0
+    positions: Floats = low + shares * (high - low)
+    return positions
 
 
-def turned(rotation: Rotation, vector: Vector) -> Vector:
-    """Return a vector that is rotated."""
-    a, b, c, d, e, f, g, h, i = rotation
-    x, y, z = vector
-    return a * x + d * y + g * z, b * x + e * y + h * z, c * x + f * y + i * z
+def shifted(pose: Transform, way: Vector, turn: Vector) -> Transform:
+    """Return a pose that is moved, and turned by a rotation vector, in the axes of its parent."""
+    angle, (x, y, z), (u, v, w), (a, b, c) = math.hypot(*turn), pose.translation, way, turn
+    scale = 1 / max(angle, _LEAST_SINE)
+    rotation = rotation_about((a * scale, b * scale, c * scale), angle)
+    return Transform((x + u, y + v, z + w), product(rotation, pose.rotation))
 
 
-def inverted(rotation: Rotation) -> Rotation:
-    """Return the inverse of a rotation: its transpose."""
-    a, b, c, d, e, f, g, h, i = rotation
-    return a, d, g, b, e, h, c, f, i
-
-
-def compose(outer: Pose, inner: Pose) -> Pose:
-    """Return the pose of a frame, given in another one as `inner`, in the frame of `outer`."""
-    x, y, z = turned(outer[0], inner[1])
-    u, v, w = outer[1]
-    return times(outer[0], inner[0]), (x + u, y + v, z + w)
-
-
-def rotation_of(quaternion: Quaternion) -> Rotation:
-    """Return the rotation matrix of a unit quaternion x, y, z, w."""
-    x, y, z, w = quaternion
-    return (
-        1 - 2 * (y * y + z * z),
-        2 * (x * y + w * z),
-        2 * (x * z - w * y),
-        2 * (x * y - w * z),
-        1 - 2 * (x * x + z * z),
-        2 * (y * z + w * x),
-        2 * (x * z + w * y),
-        2 * (y * z - w * x),
-        1 - 2 * (x * x + y * y),
-    )
-
-
-def rotation_vector(rotation: Rotation) -> Vector:
+def rotation_vector(rotation: Quaternion) -> Vector:
     """Return axis times angle of a rotation, rad, with an angle of at most half a turn."""
-    a, b, c, d, e, f, g, h, i = rotation
-    x, y, z = (f - h) / 2, (g - c) / 2, (b - d) / 2
-    sine, cosine = math.sqrt(x * x + y * y + z * z), (a + e + i - 1) / 2
-    angle = math.atan2(sine, cosine)
-    if sine > _LEAST_SINE:
-        scale = angle / sine
-        return x * scale, y * scale, z * scale
-    if cosine > 0:
-        return x, y, z
-    # Half a turn: R + 1 = 2 * axis * axis^T, of which the longest column is the most accurate.
-    columns = ((a + 1, b, c), (d, e + 1, f), (g, h, i + 1))
-    x, y, z = max(columns, key=lambda column: math.hypot(*column))
-    scale = angle / math.hypot(x, y, z)
+    x, y, z, w = rotation
+    sine = math.hypot(x, y, z)
+    scale = 2 * math.atan2(sine, abs(w)) / sine if sine > _LEAST_SINE else 2.0
+    scale = math.copysign(scale, w)  # the quaternion with the other sign is the same rotation
     return x * scale, y * scale, z * scale
 
 
-def rotation_by(vector: Vector) -> Rotation:
-    """Return the rotation about a vector by its length, rad; the inverse of `rotation_vector`."""
-    angle = math.hypot(*vector)
-    half = math.sin(angle / 2) / angle if angle > _LEAST_SINE else 0.5
-    x, y, z = vector
-    return rotation_of((x * half, y * half, z * half, math.cos(angle / 2)))
-
-
-def _onto(axis: Vector) -> Rotation:
+def _onto(axis: Vector) -> Quaternion:
     """Return a rotation that turns the z axis onto a unit vector."""
     x, y, z = axis
     if z < -0.999999:
-        return 1.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, -1.0
-    scale = 1 / (1 + z)
-    return 1 - x * x * scale, -x * y * scale, -x, -x * y * scale, 1 - y * y * scale, -y, x, y, z
+        return 1.0, 0.0, 0.0, 0.0
+    length = math.hypot(x, y, 1 + z)
+    return -y / length, x / length, 0.0, (1 + z) / length

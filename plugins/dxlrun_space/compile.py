@@ -84,7 +84,7 @@ def _solved(compilation: Compilation, chain: Chain, pose: form.TipPose) -> Row |
     return {
         "joints": dict(zip(chain.joints, found.positions, strict=True)),
         "orientation_error": found.residual.orientation if goal.asks_orientation else 0.0,
-        "dexterity": dexterity(chain, [found.positions])[0],
+        "dexterity": dexterity(chain, [found.positions])[1].item(),
         "margin": margins[least],
         "margin_joint": chain.joints[least],
         "margin_unit": plans[least].unit.si,

@@ -10,11 +10,15 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections.abc import Generator, Sequence
+from itertools import accumulate
 from typing import Final
 
 import msgspec
+import numpy as np
 
-from dxlrun_space.chain import Pose, Vector, rotation_by, times
+from dxlrun import Floats
+from dxlrun.tooling.robots import Transform
+from dxlrun_space.chain import shifted
 from dxlrun_space.solver import CLOSE_M, Residual, Solver, distance, residual_of
 
 Positions = tuple[float, ...]
@@ -31,10 +35,14 @@ _JUMP_RAD: Final = 0.06
 _BEND_RAD: Final = 0.002
 """Largest change of a joint's way between two pairs of nodes, rad or m: where a joint comes to its limit,
 nodes are closer, because a spline would leave the line by 1 mm."""
+_MARGIN: Final = 0.8
+"""Part of the jump and bend limits that the next node is planned for."""
 _LEASH_RAD: Final = 0.05
 """Largest change of a joint toward the posture between two nodes, rad or m."""
 _SHARE: Final = 0.5
 """Part of a joint's acceleration limit for each of two terms: the path's curvature, and changes of speed."""
+_TIP_SHARE: Final = 0.7
+"""The same of the tip, where curvature acts across the path and changes of speed along it."""
 _LEAST: Final = 1e-9
 _ROUNDING: Final = 1e-6
 """Largest distance of a position from a limit in other digits of the same angle, rad or m."""
@@ -70,6 +78,7 @@ class Path:
     Args:
         places: Place of each node on the path, 0 to 1.
         nodes: Joint positions of each node, rad or m.
+        slopes: Derivative of the positions by the place at each node.
         times: Time of each node, s.
         speeds: Speed of the place at each node, 1/s.
         residual: Distance of the last node from the pose that was asked.
@@ -80,16 +89,17 @@ class Path:
         self,
         places: Sequence[float],
         nodes: Sequence[Positions],
+        slopes: Sequence[Sequence[float]],
         times: Sequence[float],
         speeds: Sequence[float],
         *,
         residual: Residual,
         solver: Solver,
     ) -> None:
-        self._places, self._nodes, self._times, self._speeds = places, nodes, times, speeds
-        self._slopes = _slopes(places, nodes)
-        self._lower = tuple(map(min, solver.lower, nodes[0]))
-        self._upper = tuple(map(max, solver.upper, nodes[0]))
+        self._places, self._times, self._speeds = places, times, speeds
+        self._nodes, self._slopes = nodes, slopes
+        self._lower = [*map(min, solver.lower, nodes[0])]
+        self._upper = [*map(max, solver.upper, nodes[0])]
         self.residual = residual
         self.duration_s = times[-1]
 
@@ -100,47 +110,24 @@ class Path:
 
     def sample(self, time_s: float) -> Sample:
         """Return positions and velocities at a time since the start, s."""
-        still = (0.0,) * len(self.last)
-        if time_s >= self.duration_s:
-            return Sample(self.last, still)
-        if time_s <= 0.0:
-            return Sample(self._nodes[0], still)
+        if not 0.0 < time_s < self.duration_s:
+            return Sample(self._nodes[-1 if time_s >= self.duration_s else 0], (0.0,) * len(self.last))
         index = bisect_right(self._times, time_s) - 1
-        begin, speed = self._times[index], self._speeds[index]
-        span = self._times[index + 1] - begin
-        passed = time_s - begin
-        slope = (self._speeds[index + 1] - speed) / span
+        passed, speed = time_s - self._times[index], self._speeds[index]
+        slope = (self._speeds[index + 1] - speed) / (self._times[index + 1] - self._times[index])
         way = self._places[index + 1] - self._places[index]
         share = min(1.0, (speed + slope * passed / 2) * passed / way)
-        return self._between(index, share, way, (speed + slope * passed) / way)
-
-    def _between(self, index: int, share: float, way: float, rate: float) -> Sample:
-        """Return the cubic Hermite spline between two nodes, and its derivative by time."""
-        square, cube = share * share, share * share * share
-        first, last = 2 * cube - 3 * square + 1, 3 * square - 2 * cube
-        out, into = (cube - 2 * square + share) * way, (cube - square) * way
-        bend, leave, enter = (
-            6 * (square - share),
-            (3 * square - 4 * share + 1) * way,
-            (3 * square - 2 * share) * way,
-        )
-        rows = tuple(
-            zip(
-                self._nodes[index],
-                self._nodes[index + 1],
-                self._slopes[index],
-                self._slopes[index + 1],
-                strict=True,
-            )
-        )
-        return Sample(
-            # Between a node at a limit and the next one, a spline would pass the limit.
-            tuple(
-                min(max(first * a + last * b + out * m + into * n, lower), upper)
-                for (a, b, m, n), lower, upper in zip(rows, self._lower, self._upper, strict=True)
-            ),
-            tuple((bend * (a - b) + leave * m + enter * n) * rate for a, b, m, n in rows),
-        )
+        rate = (speed + slope * passed) / way
+        positions, velocities = [], []
+        ends = *self._nodes[index : index + 2], *self._slopes[index : index + 2]
+        # A cubic Hermite spline. Between a node at a limit and the next one, it would pass the limit.
+        for a, b, m, n, lower, upper in zip(*ends, self._lower, self._upper, strict=True):
+            leaving, entering = m * way, n * way
+            bend, twist = 3 * (b - a) - 2 * leaving - entering, leaving + entering - 2 * (b - a)
+            position = a + share * (leaving + share * (bend + share * twist))
+            positions.append(min(max(position, lower), upper))
+            velocities.append((leaving + share * (2 * bend + 3 * share * twist)) * rate)
+        return Sample(tuple(positions), tuple(velocities))
 
 
 Planning = Generator[None, None, Path | NoPath]
@@ -148,7 +135,7 @@ Planning = Generator[None, None, Path | NoPath]
 
 
 def plan_joints(
-    solver: Solver, start: Positions, target: Pose, limits: MotionLimits, *, exact: bool
+    solver: Solver, start: Positions, target: Transform, limits: MotionLimits, *, exact: bool
 ) -> Planning:
     """Plan a motion in which all joints turn evenly from the start to the pose."""
     found = yield from solver.search(target, start, exact=exact)
@@ -158,7 +145,7 @@ def plan_joints(
 
 
 def plan_positions(
-    solver: Solver, start: Positions, goal: Positions, target: Pose, limits: MotionLimits
+    solver: Solver, start: Positions, goal: Positions, target: Transform, limits: MotionLimits
 ) -> Planning:
     """Plan a motion in which all joints turn evenly from the start to goal positions."""
     for joint, at, low, high in zip(solver.chain.joints, goal, solver.lower, solver.upper, strict=True):
@@ -172,7 +159,7 @@ def plan_positions(
 
 
 def plan_line(
-    solver: Solver, start: Positions, target: Pose, limits: MotionLimits, *, exact: bool
+    solver: Solver, start: Positions, target: Transform, limits: MotionLimits, *, exact: bool
 ) -> Planning:
     """Plan a motion in which the tip moves on a straight line and turns about one axis to the pose."""
     search = solver.search(target, start, exact=True) if exact else solver.search_place(target, start)
@@ -180,33 +167,33 @@ def plan_line(
     if not suffices(found.residual, exact):
         return NoPath(out_of_reach(found.residual, exact))
     begin = solver.chain.pose(start)
-    way, turn = distance(begin, target)
-    length = math.hypot(*way)
-    count = _count(max(length / _NODE_M, math.hypot(*turn) / _NODE_RAD))
+    (x, y, z), (u, v, w) = distance(begin, target)
+    length = math.hypot(x, y, z)
+    count = _count(max(length / _NODE_M, math.hypot(u, v, w) / _NODE_RAD))
     places, nodes = [0.0], [start]
-    step = finest = 1.0 / count
-    finest /= 2**_SPLITS
-    while places[-1] < 1.0 - _LEAST:
-        place = min(1.0, places[-1] + step)
-        here = _along(begin, way, turn, place) if place < 1.0 else target
-        found = yield from solver.search_from(
-            here, _guess(places, nodes, place), exact=exact, leash=_LEASH_RAD
-        )
-        change = max(abs(a - b) for a, b in zip(found.positions, nodes[-1], strict=True))
-        bend = _bend([*places[-2:], place], [*nodes[-2:], found.positions])
-        smooth = change <= _JUMP_RAD and bend <= _BEND_RAD
-        if suffices(found.residual, exact) and smooth:
+    step = 1.0 / count
+    while places[-1] < 1.0:
+        place = places[-1] + step
+        here = target
+        if place < 1.0 - _LEAST:
+            here = shifted(begin, (x * place, y * place, z * place), (u * place, v * place, w * place))
+        else:
+            place = 1.0
+        guess = _guess(places, nodes, place)
+        found = yield from solver.search_from(here, guess, exact=exact, leash=_LEASH_RAD)
+        effort = _effort([*places[-2:], place], [*nodes[-2:], found.positions])
+        is_solved = suffices(found.residual, exact)
+        if is_solved and effort <= 1.0:
             places.append(place)
             nodes.append(found.positions)
-            step = min(2 * step, 1.0 / count)
-        elif step > finest and len(nodes) < _MOST_SPLIT:
-            step /= 2
-        else:
+        elif step * count <= 0.5**_SPLITS or len(nodes) >= _MOST_SPLIT:
             passed, whole = places[-1] * length * 1e3, length * 1e3
             return NoPath(
                 f"the straight line ends after {passed:.0f} of {whole:.0f} mm, at a limit of a joint or "
                 "where a joint would leap; write path=joints"
             )
+        factor = min(2.0, max(0.25, _MARGIN / max(effort, _LEAST))) if is_solved else 0.5
+        step = min(max(step * factor, 0.5**_SPLITS / count), 1.0 / count)
         yield
     return (yield from _timed(solver, places, nodes, target, limits))
 
@@ -226,12 +213,6 @@ def _count(needed: float) -> int:
     return min(_MOST_NODES, max(_FEWEST_NODES, math.ceil(needed)))
 
 
-def _along(begin: Pose, way: Vector, turn: Vector, place: float) -> Pose:
-    (x, y, z), (u, v, w), (a, b, c) = begin[1], way, turn
-    rotation = times(rotation_by((a * place, b * place, c * place)), begin[0])
-    return rotation, (x + u * place, y + v * place, z + w * place)
-
-
 def _guess(places: Sequence[float], nodes: Sequence[Positions], place: float) -> Positions:
     """Return the positions at a place by the line through the last two nodes."""
     if len(nodes) < 2:
@@ -240,137 +221,88 @@ def _guess(places: Sequence[float], nodes: Sequence[Positions], place: float) ->
     return tuple(b + (b - a) * share for a, b in zip(nodes[-2], nodes[-1], strict=True))
 
 
-def _bend(places: Sequence[float], nodes: Sequence[Positions]) -> float:
-    """Return by how much a joint leaves the line through its last two nodes, rad or m; 0 for two nodes."""
+def _effort(places: Sequence[float], nodes: Sequence[Positions]) -> float:
+    """Return the part of the limits of jump and bend that the last of two or three nodes takes.
+
+    The bend grows with the square of the distance of two nodes, so it counts by its root.
+    """
+    jump = max(abs(a - b) for a, b in zip(nodes[-2], nodes[-1], strict=True))
     if len(nodes) < 3:
-        return 0.0
+        return jump / _JUMP_RAD
     first, last = places[1] - places[0], places[2] - places[1]
-    turns: list[float] = [abs((c - b) / last - (b - a) / first) for a, b, c in zip(*nodes, strict=True)]
-    return min(first, last) * max(turns)
-
-
-def _slopes(places: Sequence[float], nodes: Sequence[Positions]) -> list[Positions]:
-    """Return the derivative of the positions by the place at each node, from its two neighbours."""
-    steps = [
-        tuple((b - a) / (t - s) for a, b in zip(first, last, strict=True))
-        for s, t, first, last in zip(places, places[1:], nodes, nodes[1:], strict=False)
-    ]
-    slopes = [steps[0]]
-    for index in range(1, len(steps)):
-        before, after = places[index] - places[index - 1], places[index + 1] - places[index]
-        share = after / (before + after)
-        slopes.append(
-            tuple(share * a + (1 - share) * b for a, b in zip(steps[index - 1], steps[index], strict=True))
-        )
-    return [*slopes, steps[-1]]
-
-
-class _Node(msgspec.Struct):
-    """Greatest speed and change of speed of the place at a node, 1/s and 1/s^2."""
-
-    speed: float
-    change: float
+    turns = (abs((c - b) / last - (b - a) / first) for a, b, c in zip(*nodes, strict=True))
+    return max(jump / _JUMP_RAD, math.sqrt(min(first, last) * max(turns) / _BEND_RAD))
 
 
 def _timed(
-    solver: Solver, places: Sequence[float], nodes: Sequence[Positions], target: Pose, limits: MotionLimits
-) -> Planning:
-    """Give each node its time."""
-    poses: list[Pose] = []
-    for node in nodes:
-        poses.append(solver.chain.pose(node))
-        yield
-    residual = residual_of(poses[-1], target)
-    count = len(nodes)
-    slopes = _slopes(places, nodes)
-    yield
-    steps: list[_Segment] = []
-    for index in range(count - 1):
-        steps.append(_segment(places, nodes, slopes, poses, index))
-        if index % 8 == 0:
-            yield
-    if all(max(step.rates) < _LEAST for step in steps):
-        return Path(places, nodes, [0.0] * count, [0.0] * count, residual=residual, solver=solver)
-    bounds: list[_Node] = []
-    for index in range(count):
-        near = steps[max(0, index - 1) : index + 1]
-        bounds.append(_bounds(near, limits))
-        if index % 8 == 0:
-            yield
-    speeds = [bound.speed for bound in bounds]
-    speeds[0] = speeds[-1] = 0.0
-    # Forward, no node is passed faster than the acceleration before it allows; backward, than braking does.
-    for index in range(1, count):
-        speeds[index] = min(speeds[index], _faster(speeds[index - 1], bounds, places, index - 1))
-    yield
-    for index in range(count - 2, -1, -1):
-        speeds[index] = min(speeds[index], _faster(speeds[index + 1], bounds, places, index))
-    yield
-    moments = [0.0]
-    for index in range(count - 1):
-        way = places[index + 1] - places[index]
-        moments.append(moments[-1] + 2 * way / (speeds[index] + speeds[index + 1]))
-    return Path(places, nodes, moments, speeds, residual=residual, solver=solver)
-
-
-def _faster(speed: float, bounds: Sequence[_Node], places: Sequence[float], index: int) -> float:
-    """Return the speed at the other end of a segment that begins or ends with `speed`."""
-    change = min(bounds[index].change, bounds[index + 1].change)
-    return math.sqrt(speed * speed + 2 * change * (places[index + 1] - places[index]))
-
-
-class _Segment(msgspec.Struct, frozen=True):
-    """Derivatives by the place between two nodes, and the length of the segment."""
-
-    way: float
-    rates: Positions
-    """Largest first derivative of each joint on the spline."""
-    bends: Positions
-    """Largest second derivative of each joint on the spline, which is at one of its ends."""
-    linear: Vector
-    angular: float
-
-
-def _segment(
+    solver: Solver,
     places: Sequence[float],
     nodes: Sequence[Positions],
-    slopes: Sequence[Positions],
-    poses: Sequence[Pose],
-    index: int,
-) -> _Segment:
-    way = places[index + 1] - places[index]
-    (x, y, z), turn = distance(poses[index], poses[index + 1])
-    rates, bends = [], []
-    for a, b, m, n in zip(nodes[index], nodes[index + 1], slopes[index], slopes[index + 1], strict=True):
-        chord = (b - a) / way
-        middle = 1.5 * chord - (m + n) / 4
-        rates.append(max(abs(m), abs(n), abs(middle)))
-        bends.append(max(abs(6 * chord - 4 * m - 2 * n), abs(6 * chord - 2 * m - 4 * n)) / way)
-    return _Segment(way, tuple(rates), tuple(bends), (x / way, y / way, z / way), math.hypot(*turn) / way)
+    target: Transform,
+    limits: MotionLimits,
+) -> Planning:
+    """Give each node its time."""
+    poses: list[Transform] = []
+    for node in nodes:
+        poses.append(solver.chain.pose(node))
+        if len(poses) % 3 == 0:  # as long as a step of a search
+            yield
+    ways = np.diff(places)
+    slopes = _slopes(ways, np.array(nodes))
+    tops, gains = _bounds(ways, np.array(nodes), slopes, poses, limits)
+    yield
+    speeds = [0.0, *tops, 0.0]
+    # Forward, no node is passed faster than the acceleration before it allows; backward, than braking does.
+    for index, gain in enumerate(gains):
+        speeds[index + 1] = min(speeds[index + 1], math.sqrt(speeds[index] ** 2 + gain))
+    for index, gain in reversed([*enumerate(gains)]):
+        speeds[index] = min(speeds[index], math.sqrt(speeds[index + 1] ** 2 + gain))
+    if np.abs(slopes).max() < _LEAST:
+        times = speeds = [0.0] * len(nodes)
+    else:
+        pairs = zip(ways.tolist(), speeds, speeds[1:], strict=False)
+        times = [*accumulate((2 * way / (a + b) for way, a, b in pairs), initial=0.0)]
+    residual = residual_of(poses[-1], target)
+    return Path(places, nodes, slopes.tolist(), times, speeds, residual=residual, solver=solver)
 
 
-def _bounds(near: Sequence[_Segment], limits: MotionLimits) -> _Node:
-    """Return the bounds at a node between one or two segments."""
-    speed = change = math.inf
-    first, last = near[0], near[-1]
-    for segment in near:
-        for rate, bend, top, most in zip(
-            segment.rates, segment.bends, limits.velocity, limits.acceleration, strict=True
-        ):
-            speed = min(speed, top / max(rate, _LEAST), math.sqrt(_SHARE * most / max(bend, _LEAST)))
-            change = min(change, _SHARE * most / max(rate, _LEAST))
-    linear = max(math.hypot(*first.linear), math.hypot(*last.linear), _LEAST)
-    angular = max(first.angular, last.angular, _LEAST)
-    between = (first.way + last.way) / 2
-    bend = math.hypot(*(b - a for a, b in zip(first.linear, last.linear, strict=True))) / between
-    # Changes of speed act along the path and curvature across it, so each may have 0.7 of the limit.
-    most = 0.7 * limits.linear_acceleration
-    speed = min(speed, limits.linear_velocity / linear, limits.angular_velocity / angular)
-    speed = min(speed, math.sqrt(most / max(bend, _LEAST)))
-    return _Node(speed, min(change, most / linear, limits.angular_acceleration / angular))
+def _slopes(ways: Floats, nodes: Floats) -> Floats:
+    """Return the derivative of the positions by the place at each node, from its two neighbours."""
+    chords = np.diff(nodes, axis=0) / ways[:, None]
+    share = (ways[1:] / (ways[:-1] + ways[1:]))[:, None]
+    return np.concatenate((chords[:1], share * chords[:-1] + (1 - share) * chords[1:], chords[-1:]))
 
 
-def shifted(pose: Pose, way: Vector, turn: Vector) -> Pose:
-    """Return a pose that is moved and turned in the axes of its parent."""
-    (x, y, z), (u, v, w) = pose[1], way
-    return times(rotation_by(turn), pose[0]), (x + u, y + v, z + w)
+def _bounds(
+    ways: Floats, nodes: Floats, slopes: Floats, poses: Sequence[Transform], limits: MotionLimits
+) -> tuple[list[float], list[float]]:
+    """Return bounds of the speed of the place.
+
+    Returns:
+        Highest speed at each node but the first and the last, 1/s; largest change of the squared speed
+        between each two nodes, 1/s^2.
+    """
+    # Largest derivatives of each joint on the spline between two nodes; the second one is at one of its ends.
+    chords, begin, end = np.diff(nodes, axis=0) / ways[:, None], slopes[:-1], slopes[1:]
+    rates = np.maximum.reduce(np.abs((begin, end, 1.5 * chords - (begin + end) / 4)))
+    bends = np.maximum.reduce(np.abs((6 * chords - 4 * begin - 2 * end, 6 * chords - 2 * begin - 4 * end)))
+    rates, bends = np.maximum(rates, _LEAST), np.maximum(bends / ways[:, None], _LEAST)
+    places = np.diff([pose.translation for pose in poses], axis=0) / ways[:, None]
+    linear = np.maximum(_lengths(places), _LEAST)
+    # The length of a short turn is twice that of the way of its quaternion.
+    angular = np.maximum(2 * _lengths(np.diff([pose.rotation for pose in poses], axis=0)) / ways, _LEAST)
+    share, tip_share = _SHARE * np.array(limits.acceleration), _TIP_SHARE * limits.linear_acceleration
+    joints = np.minimum(np.array(limits.velocity) / rates, np.sqrt(share / bends)).min(axis=1)
+    tops = np.minimum.reduce((joints, limits.linear_velocity / linear, limits.angular_velocity / angular))
+    changes = np.minimum.reduce(
+        ((share / rates).min(axis=1), tip_share / linear, limits.angular_acceleration / angular)
+    )
+    bend = np.maximum(_lengths(np.diff(places, axis=0)) / ((ways[:-1] + ways[1:]) / 2), _LEAST)
+    near = np.pad(changes, 1, "edge")
+    gains = 2 * ways * np.minimum.reduce((near[:-2], near[1:-1], near[2:]))
+    return np.minimum.reduce((tops[:-1], tops[1:], np.sqrt(tip_share / bend))).tolist(), gains.tolist()
+
+
+def _lengths(rows: Floats) -> Floats:
+    lengths: Floats = np.sqrt(sum(column * column for column in rows.T))
+    return lengths

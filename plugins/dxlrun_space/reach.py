@@ -13,7 +13,7 @@ from dxlrun import Floats, InputError
 from dxlrun.tooling.output import check_target, show_parts, write_target
 from dxlrun.tooling.robots import read_urdf
 from dxlrun.tooling.verbs import Assignment, RobotPath, compiled, missing_extra
-from dxlrun_space.chain import Chain, WrongChain
+from dxlrun_space.chain import Chain, WrongChain, spread
 
 POSTURES: Final = 20_000
 
@@ -45,12 +45,10 @@ def draw_reach(robot: RobotPath, tip: str, picture: Path, /, *assignments: Assig
             raise WrongChain("", f"{missed[0]} moves {tip}, but has no servo", f"add {missed[0]} to `joints`")
     except WrongChain as wrong:
         raise InputError(str(wrong)) from None
-    lower, upper = np.clip([limits[joint] for joint in chain.joints], -np.pi, np.pi).T
-    postures = np.random.default_rng(0).uniform(lower, upper, (POSTURES, len(lower))).tolist()
-    places = np.array([chain.pose(posture)[1] for posture in postures]) * 1e3
-    write_target(
-        picture, _drawn(places, dexterity(chain, postures), f"{tip} of {plan.robot}", picture.suffix[1:])
-    )
+    lower, upper = zip(*(limits[joint] for joint in chain.joints), strict=True)
+    places, found = dexterity(chain, spread(lower, upper, POSTURES).tolist())
+    places *= 1e3
+    write_target(picture, _drawn(places, found, f"{tip} of {plan.robot}", picture.suffix[1:]))
     ends = zip("xyz", places.min(axis=0), places.max(axis=0), strict=True)
     show_parts(
         f"{tip}: {', '.join(f'{axis} {low:.0f}..{high:.0f} mm' for axis, low, high in ends)}; {picture}"
@@ -58,22 +56,21 @@ def draw_reach(robot: RobotPath, tip: str, picture: Path, /, *assignments: Assig
     return 0
 
 
-def dexterity(chain: Chain, postures: Iterable[Sequence[float]]) -> list[float]:
-    """Return the dexterity of the tip at joint positions: 1 in all directions alike, 0 singular.
+def dexterity(chain: Chain, postures: Iterable[Sequence[float]]) -> tuple[Floats, Floats]:
+    """Return place and dexterity of the tip at joint positions: 1 in all directions alike, 0 singular.
 
     This is the inverse condition number of the Jacobian of the tip's place (J. K. Salisbury and J. J. Craig,
     "Articulated hands: force control and kinematic issues", 1982).
     """
-    columns = []
+    places, columns = [], []
     for posture in postures:
-        chain.pose(posture)
+        places.append(chain.pose(posture).translation)
         columns.append([column[:3] for column in chain.jacobian()])
     speeds = np.linalg.svd(np.array(columns), compute_uv=False)
-    found: list[float] = (speeds[:, -1] / np.maximum(speeds[:, 0], 1e-12)).tolist()
-    return found
+    return np.array(places), speeds[:, -1] / np.maximum(speeds[:, 0], 1e-12)
 
 
-def _drawn(places: Floats, colours: Sequence[float], title: str, form: str) -> bytes:
+def _drawn(places: Floats, colours: Floats, title: str, form: str) -> bytes:
     from matplotlib.figure import Figure
 
     figure, content = Figure(figsize=(9, 4.2), layout="constrained"), io.BytesIO()

@@ -3,23 +3,28 @@
 Levenberg-Marquardt with projection onto the limits (J. J. Moré, "The Levenberg-Marquardt algorithm", 1978;
 for inverse kinematics T. Sugihara, "Solvability-unconcerned inverse kinematics by the Levenberg-Marquardt
 method", IEEE T-RO 2011). A step has a bounded cost, so a cycle affords a fixed number of steps.
+
+An orientation error counts as an arc, m: the angle times a lever, which is a fraction of the arm's length.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Generator, Sequence
+from itertools import compress
+from operator import mul
 from typing import Final
 
 import msgspec
 import numpy as np
 
-from dxlrun_space.chain import Chain, Column, Pose, Vector, inverted, rotation_vector, times
+from dxlrun.tooling.robots import Transform, conjugate, product
+from dxlrun_space.chain import Chain, Column, Vector, rotation_vector, spread
 
 EXACT: Final = 0.3
-"""Weight of the orientation where it must be reached, as a fraction of the arm's length, m/rad."""
+"""Lever of the orientation where it must be reached."""
 NEAREST: Final = 0.002
-"""Weight where position comes first: 1 rad of orientation moves the solution by less than 0.01 mm."""
+"""Lever where position comes first: 1 rad of orientation moves the solution by less than 0.01 mm."""
 CLOSE_M: Final = 2e-5
 """Position error of a solution, m. A tick of 0.088 deg moves the tip of an arm of 0.3 m by 0.5 mm."""
 CLOSE_RAD: Final = 2e-4
@@ -28,21 +33,31 @@ STEPS: Final = 20
 """Steps per start of a search."""
 SAMPLES: Final = 1000
 """Positions whose poses are known beforehand. A search begins at those with the nearest poses."""
-STARTS: Final = 64
-"""Most starts for position and orientation; 42 were the most of 2000 poses of four arms."""
-FIRST_PLACES: Final = 4
-PLACES: Final = 8
+FIRST_STARTS: Final = 16
+"""Starts for position and orientation at the nearest samples, enough for 99.9 % of the poses in reach."""
+LAST_START: Final = 208
+START_STRIDE: Final = 3
+"""Each third of the samples up to the last start: neighbours lead to the same solution."""
+PLACES: Final = 16
 """Starts for the position alone. Where the arm is folded, limits keep some of them from a place in reach."""
-_FAR: Final = 0.05
-"""Position error, as a fraction of the length, beyond which a pose counts as out of reach after the first."""
+FIRST_PLACES: Final = 6
+"""Starts for a position beyond `_FAR`."""
+_FAR: Final = 0.2
+"""Position error, as a fraction of the length, beyond which a position is surely out of reach."""
+_NEAR: Final = 0.05
+"""Position error, as a fraction of the length, within which orientations are tried."""
+_ALIKE: Final = 0.01
+"""Difference of all joints below which two starts lead to one solution, rad or m."""
 _FAILING: Final = 0.8
 """A start is given up when two steps together do not reduce the cost to this fraction."""
 _STALLING: Final = 1 - 1e-5
-"""Ratio of two costs beyond which the nearest position is found: the rest is 0.01 mm in 1 m."""
+"""Ratio of two costs beyond which the nearest pose is found."""
+_STALLING_PLACE: Final = 1 - 1e-6
+"""The same of the nearest position, which is reported: the rest is 0.1 mm in 1 m."""
 _POSTURE: Final = 1e-5
-"""Weight of the distance from the posture, as a fraction of the arm's length, m/rad."""
+"""Lever of the distance from the posture."""
 _PULL: Final = 0.02
-"""Weight of the posture of an arm with more joints than a pose needs, as a fraction of the length, m/rad."""
+"""Lever of the posture of an arm with more joints than a pose needs."""
 _LONGEST_STEP: Final = 1.0
 """Largest change of a joint in a step, rad or m: the linear model is not valid for more."""
 _STILL: Final = 1e-7
@@ -51,7 +66,7 @@ _DAMPING: Final = (1e-3, 1e-7, 1e-12, 1e3)
 """First damping, that of a start near the solution, smallest, and largest: parts of the squared length."""
 FULL: Final = 6
 """Degrees of freedom of a pose. Fewer joints lack orientations, and more leave a choice."""
-_PRIMES: Final = (2, 3, 5, 7, 11, 13, 17, 19, 23)
+_UNLIMITED: Final = (-math.inf, math.inf)
 
 
 class Residual(msgspec.Struct, frozen=True):
@@ -74,10 +89,15 @@ class Residual(msgspec.Struct, frozen=True):
 
 
 class Solution(msgspec.Struct, frozen=True):
-    """Joint positions with their distance from the target."""
+    """Joint positions with their distance from the target, and the linear model of that distance."""
 
     positions: tuple[float, ...]
     residual: Residual
+    cost: float
+    """Squared distance with all levers, m^2."""
+    gradient: list[float]
+    """Descent of half the cost by each joint."""
+    columns: list[Column]
 
 
 Search = Generator[None, None, Solution]
@@ -94,13 +114,13 @@ def finish_search(search: Search) -> Solution:
             return found
 
 
-def distance(pose: Pose, target: Pose) -> tuple[Vector, Vector]:
+def distance(pose: Transform, target: Transform) -> tuple[Vector, Vector]:
     """Return the way from a pose to its target: translation, m, and rotation vector, rad, in the base."""
-    (x, y, z), (u, v, w) = pose[1], target[1]
-    return (u - x, v - y, w - z), rotation_vector(times(target[0], inverted(pose[0])))
+    (x, y, z), (u, v, w) = pose.translation, target.translation
+    return (u - x, v - y, w - z), rotation_vector(product(target.rotation, conjugate(pose.rotation)))
 
 
-def residual_of(pose: Pose, target: Pose) -> Residual:
+def residual_of(pose: Transform, target: Transform) -> Residual:
     """Return the distance of a pose from its target."""
     way, turn = distance(pose, target)
     return Residual(math.hypot(*way), math.hypot(*turn))
@@ -125,35 +145,29 @@ class Solver:
     ) -> None:
         self.chain = chain
         self.lower, self.upper = tuple(lower), tuple(upper)
+        self._limits = tuple(zip(lower, upper, strict=True))
         self._posture = tuple(posture) or (None,) * len(chain.joints)
         self._redundant = len(chain.joints) > FULL and any(each is not None for each in self._posture)
         self._tendency = (_POSTURE * chain.length) ** 2
-        self._unlimited = (-math.inf,) * len(self.lower), (math.inf,) * len(self.upper)
-        self._samples = [self._spread(number) for number in range(SAMPLES)]
-        poses = [(*place, *rotation) for rotation, place in map(chain.pose, self._samples)]
-        self._table = np.array(poses).T.copy()
-        """Position and rotation matrix of each sample, one column each."""
+        self._samples = [*map(tuple, spread(lower, upper, SAMPLES).tolist())]
+        self._table = np.array(
+            [(*pose.translation, *pose.rotation) for pose in map(chain.pose, self._samples)]
+        ).T.copy()
+        """Position and quaternion of each sample, one column each."""
 
-    def _spread(self, number: int) -> tuple[float, ...]:
-        """Return positions that are spread evenly over the limits: a Halton sequence."""
-        positions = []
-        for index, (lower, upper) in enumerate(zip(self.lower, self.upper, strict=True)):
-            low, high = max(lower, -math.pi), min(upper, math.pi)
-            positions.append(low + _halton(number + 1, _PRIMES[index % len(_PRIMES)]) * (high - low))
-        return tuple(positions)
-
-    def _nearest(self, target: Pose, weight: float) -> list[tuple[float, ...]]:
-        """Return the samples, the one with the nearest pose first.
+    def _nearest(self, target: Transform, lever: float) -> list[tuple[float, ...]]:
+        """Return the samples by the distance of their poses, the nearest first.
 
         Sums and products of single elements only, which are the same on each processor.
         """
-        half = (weight * self.chain.length) ** 2 / 2
-        far = np.zeros(SAMPLES)
-        for index, value in enumerate((*target[1], *target[0])):
-            far += (self._table[index] - value) ** 2 * (half if index > 2 else 1.0)
-        return [self._samples[index] for index in far.argsort(kind="stable")[:STARTS].tolist()]
+        x, y, z, *turn = self._table
+        a, b, c = target.translation
+        far = (x - a) ** 2 + (y - b) ** 2 + (z - c) ** 2
+        alike = sum(one * other for one, other in zip(turn, target.rotation, strict=True))
+        far -= (2 * lever * self.chain.length * alike) ** 2
+        return [self._samples[index] for index in far.argsort(kind="stable").tolist()]
 
-    def search(self, target: Pose, start: Sequence[float], *, exact: bool) -> Search:
+    def search(self, target: Transform, start: Sequence[float], *, exact: bool) -> Search:
         """Search from several starts; the first is `start`. The best solution is returned.
 
         The result is close to the target, or the nearest that was found: by position first unless `exact`.
@@ -161,7 +175,7 @@ class Solver:
         best = yield from self._descend(target, start, EXACT, is_patient=False)
         if not best.residual.is_close:
             place = yield from self.search_place(target, best.positions)
-            if place.residual.position > _FAR * self.chain.length:
+            if place.residual.position > _NEAR * self.chain.length:
                 return (yield from self.search_from(target, place.positions, exact=False))
             best = yield from self._search_samples(target, best, exact)
             if not exact and not best.residual.is_close:
@@ -171,7 +185,7 @@ class Solver:
             best = yield from self.search_from(target, best.positions, exact=True)
         return best
 
-    def search_place(self, target: Pose, start: Sequence[float]) -> Search:
+    def search_place(self, target: Transform, start: Sequence[float]) -> Search:
         """Search for the nearest position, with any orientation."""
         best = yield from self._descend(target, start, 0.0)
         for number, each in enumerate(self._nearest(target, 0.0)[:PLACES]):
@@ -180,22 +194,33 @@ class Solver:
                 break
             found = yield from self._descend(target, each, 0.0, 2 * STEPS)
             best = min(best, found, key=lambda one: one.residual.position)
-        return best
+        return (yield from self._descend(target, best.positions, 0.0, 5 * STEPS))
 
-    def _search_samples(self, target: Pose, best: Solution, exact: bool) -> Search:
-        for each in self._nearest(target, EXACT):
+    def _search_samples(self, target: Transform, best: Solution, exact: bool) -> Search:
+        def rank(one: Solution) -> tuple[float, float]:
+            return _rank(one.residual, exact)
+
+        tried: list[tuple[float, ...]] = []
+        nearest = self._nearest(target, EXACT)
+        for each in nearest[:FIRST_STARTS] + nearest[FIRST_STARTS:LAST_START:START_STRIDE]:
             # Limits stop most descents early, so the way may pass them. Whole turns back, its end is a start.
             free = yield from self._descend(target, each, EXACT, is_patient=False, is_limited=False)
             back = self.chain.without_turns(free.positions)
+            miss = free.residual.position + 0.1 * free.residual.orientation
+            if rank(free) >= rank(best) and miss > _NEAR * self.chain.length:
+                continue
+            if any(_apart(back, one) < _ALIKE for one in tried):
+                continue
+            tried.append(back)
             found = yield from self._descend(target, back, EXACT, is_patient=False)
-            best = min(best, found, key=lambda one: _cost(one.residual, exact))
+            best = min(best, found, key=rank)
             if best.residual.is_close:
                 return best
-        return (yield from self._descend(target, best.positions, EXACT, 5 * STEPS))
+        return (yield from self._descend(target, best.positions, EXACT, 2 * STEPS))
 
     def search_from(
         self,
-        target: Pose,
+        target: Transform,
         start: Sequence[float],
         *,
         exact: bool,
@@ -211,31 +236,32 @@ class Solver:
             steps: Most steps.
             leash: Largest distance from the start in which the posture attracts a joint, rad or m.
         """
-        weight = EXACT if exact else NEAREST
+        lever = EXACT if exact else NEAREST
         if self._redundant:
             # First a strong pull, which moves the tip by 0.1 mm, then the pose from there.
             self._tendency = (_PULL * self.chain.length) ** 2
-            start = (yield from self._descend(target, start, weight, steps, leash)).positions
+            start = (yield from self._descend(target, start, lever, steps, leash)).positions
             self._tendency, leash = (_POSTURE * self.chain.length) ** 2, 0.0
-        found = yield from self._descend(target, start, weight, steps, leash)
+        found = yield from self._descend(target, start, lever, steps, leash)
         if not exact and found.residual.position > CLOSE_M:
-            # Near a singularity even the small weight of the orientation moves the position.
+            # Near a singularity even the small lever of the orientation moves the position.
             found = yield from self._descend(target, found.positions, 0.0, steps, leash)
         return found
 
     def _descend(
         self,
-        target: Pose,
+        target: Transform,
         start: Sequence[float],
-        weight: float,
+        lever: float,
         steps: int = STEPS,
         leash: float = math.inf,
         *,
         is_patient: bool = True,
         is_limited: bool = True,
     ) -> Search:
-        scale, limits = self.chain.length, (self.lower, self.upper) if is_limited else self._unlimited
-        weight = (weight * scale) ** 2
+        scale = self.chain.length
+        limits = self._limits if is_limited else (_UNLIMITED,) * len(self._limits)
+        stalling = _STALLING if lever else _STALLING_PLACE
         first, near, least, most = (each * scale * scale for each in _DAMPING)
         damping = near if is_patient else first
         now = _inside(start, limits)
@@ -243,135 +269,113 @@ class Solver:
             a if b is None else min(max(b, a - leash), a + leash)
             for a, b in zip(now, self._posture, strict=True)
         ]
-        model = self._model(target, now, posture, weight)
+        best = self._estimate(target, now, posture, lever * scale)
         before = last = math.inf
         for _ in range(steps):
-            if model.residual.is_exact and self._tendency < model.weight * 1e-3:
+            if best.residual.is_exact and self._tendency < (lever * scale) ** 2 * 1e-3:
                 break
-            if weight == 0.0 and model.residual.position <= CLOSE_M / 20:
+            if lever == 0.0 and best.residual.position <= CLOSE_M / 20:
                 break
-            change = self._step(model, now, damping, limits)
-            trial = _inside([a + b for a, b in zip(now, change, strict=True)], limits)
-            if max(abs(a - b) for a, b in zip(trial, now, strict=True)) < _STILL:
+            change = self._step(best, damping, limits)
+            trial = _inside([a + b for a, b in zip(best.positions, change, strict=True)], limits)
+            if _apart(trial, best.positions) < _STILL:
                 break
             yield
-            tried = self._model(target, trial, posture, weight)
-            if tried.cost < model.cost:
-                is_still = weight == 0.0 and tried.cost > _STALLING * model.cost
-                now, model, damping = trial, tried, max(least, damping * 0.1)
+            tried = self._estimate(target, trial, posture, lever * scale)
+            if tried.cost < best.cost:
+                is_still = tried.cost > stalling * best.cost
+                best, damping = tried, max(least, damping * 0.1)
                 if is_still:
                     break
             elif damping >= most:
                 break
             else:
                 damping = max(damping, 1e-9 * scale * scale) * 5
-            if not is_patient and model.cost > _FAILING * before and not model.residual.is_close:
+            if not is_patient and best.cost > _FAILING * before and not best.residual.is_close:
                 break
-            before, last = last, model.cost
-        return Solution(now, model.residual)
+            before, last = last, best.cost
+        return best
 
-    def _model(
-        self, target: Pose, positions: Sequence[float], posture: Sequence[float], weight: float
-    ) -> _Model:
-        """Return the linear model of the error at joint positions: cost, gradient, and normal matrix."""
+    def _estimate(
+        self, target: Transform, positions: tuple[float, ...], posture: Sequence[float], lever: float
+    ) -> Solution:
+        """Return the distance at joint positions with its linear model; the lever is in m/rad."""
         way, turn = distance(self.chain.pose(positions), target)
-        columns = self.chain.jacobian()
-        (x, y, z), (u, v, w) = way, (turn[0] * weight, turn[1] * weight, turn[2] * weight)
-        pulls = [b - a for a, b in zip(positions, posture, strict=True)]
-        tendency = self._tendency
-        gradient = [
-            a * x + b * y + c * z + d * u + e * v + f * w + tendency * pull
-            for (a, b, c, d, e, f), pull in zip(columns, pulls, strict=True)
-        ]
-        far, off = math.hypot(x, y, z), math.hypot(*turn)
-        cost = far * far + weight * off * off + tendency * sum(pull * pull for pull in pulls)
-        return _Model(cost, gradient, columns, weight, Residual(far, off))
+        columns, tendency = self.chain.jacobian(lever), self._tendency
+        ways = [b - a for a, b in zip(positions, posture, strict=True)]
+        pulled = pulls(columns, way, turn, lever)
+        gradient = [pull + tendency * each for pull, each in zip(pulled, ways, strict=True)]
+        far, off = math.hypot(*way), math.hypot(*turn)
+        cost = far * far + (lever * off) ** 2 + tendency * math.fsum(map(mul, ways, ways))
+        return Solution(positions, Residual(far, off), cost, gradient, columns)
 
-    def _step(self, model: _Model, now: Sequence[float], damping: float, limits: _Limits) -> list[float]:
+    def _step(self, model: Solution, damping: float, limits: _Limits) -> list[float]:
         """Return the change of the joints that minimizes the model; joints at a limit do not move outward."""
-        gradient, (lower, upper) = model.gradient, limits
         free = [
-            index
-            for index, slope in enumerate(gradient)
-            if not (slope > 0 and now[index] >= upper[index])
-            and not (slope < 0 and now[index] <= lower[index])
+            not (now >= upper if slope > 0 else now <= lower)
+            for slope, now, (lower, upper) in zip(model.gradient, model.positions, limits, strict=True)
         ]
-        change = [0.0] * len(now)
-        solved = solve(
-            normal_matrix([model.columns[index] for index in free], model.weight, damping + self._tendency),
-            [gradient[index] for index in free],
-        )
-        longest = max((abs(each) for each in solved), default=0.0)
+        columns = [*compress(model.columns, free)]
+        solved = solve(normal_matrix(columns, damping + self._tendency), [*compress(model.gradient, free)])
+        longest = max(map(abs, solved), default=0.0)
         scale = _LONGEST_STEP / longest if longest > _LONGEST_STEP else 1.0
-        for index, each in zip(free, solved, strict=True):
-            change[index] = each * scale
-        return change
+        moves = iter(solved)
+        return [next(moves) * scale if each else 0.0 for each in free]
 
 
-_Limits = tuple[tuple[float, ...], tuple[float, ...]]
+_Limits = Sequence[tuple[float, float]]
 
 
 def _inside(positions: Sequence[float], limits: _Limits) -> tuple[float, ...]:
-    return tuple(min(max(each, lower), upper) for each, lower, upper in zip(positions, *limits, strict=True))
+    return tuple(min(max(each, low), high) for each, (low, high) in zip(positions, limits, strict=True))
 
 
-class _Model(msgspec.Struct, frozen=True):
-    cost: float
-    gradient: list[float]
-    columns: list[Column]
-    weight: float
-    residual: Residual
+def _apart(one: Sequence[float], other: Sequence[float]) -> float:
+    """Return the largest difference of a joint, rad or m."""
+    return max(abs(a - b) for a, b in zip(one, other, strict=True))
 
 
-def _cost(residual: Residual, exact: bool) -> tuple[float, float]:
+def _rank(residual: Residual, exact: bool) -> tuple[float, float]:
     """Return the order of solutions: position first unless `exact`, where one rad counts as 0.1 m."""
     if exact:
         return residual.position + 0.1 * residual.orientation, 0.0
     return max(residual.position, CLOSE_M), residual.orientation
 
 
-def _halton(number: int, prime: int) -> float:
-    """Return the number-th member of the van der Corput sequence, 0..1."""
-    value, share = 0.0, 1.0
-    while number:
-        share /= prime
-        number, digit = divmod(number, prime)
-        value += digit * share
-    return value
+def pulls(columns: Sequence[Column], way: Vector, turn: Vector, lever: float) -> list[float]:
+    """Return J^T e of an error or a twist of the tip, by the columns of a Jacobian with the same lever."""
+    (x, y, z), (u, v, w) = way, (turn[0] * lever, turn[1] * lever, turn[2] * lever)
+    return [a * x + b * y + c * z + d * u + e * v + f * w for a, b, c, d, e, f in columns]
 
 
-def normal_matrix(columns: Sequence[Column], weight: float, damping: float) -> list[list[float]]:
-    """Return the lower triangle of J^T W J + damping, with a weight, m^2/rad^2, for the orientation."""
-    rows: list[list[float]] = []
-    for index, (a, b, c, d, e, f) in enumerate(columns):
-        g, h, i = d * weight, e * weight, f * weight
-        rows.append(
-            [a * u + b * v + c * w + g * x + h * y + i * z for u, v, w, x, y, z in columns[: index + 1]]
-        )
-        rows[index][index] += damping
+def normal_matrix(columns: Sequence[Column], damping: float) -> list[list[float]]:
+    """Return the lower triangle of J^T J + damping."""
+    rows = [
+        [a * u + b * v + c * w + d * x + e * y + f * z for u, v, w, x, y, z in columns[:index]]
+        for index, (a, b, c, d, e, f) in enumerate(columns, 1)
+    ]
+    for row in rows:
+        row[-1] += damping
     return rows
 
 
-def solve(lower: list[list[float]], right: Sequence[float]) -> list[float]:
-    """Solve a positive definite system, given by its lower triangle, which is overwritten (Cholesky)."""
-    values: list[float] = []
-    for index, row in enumerate(lower):
-        for column in range(index):
-            other = lower[column]
-            total = row[column]
-            for a, b in zip(row[:column], other, strict=False):
-                total -= a * b
-            row[column] = total / other[column]
-        square = row[index]
-        total = right[index]
-        for a, b in zip(row[:index], values, strict=False):
-            square -= a * a
-            total -= a * b
-        row[index] = root = math.sqrt(max(square, 1e-300))
-        values.append(total / root)
-    for index in range(len(values) - 1, -1, -1):
-        total = values[index]
-        for below in range(index + 1, len(values)):
-            total -= lower[below][index] * values[below]
-        values[index] = total / lower[index][index]
-    return values
+def solve(lower: Sequence[Sequence[float]], right: Sequence[float]) -> list[float]:
+    """Solve a positive definite system, given by its lower triangle (Cholesky).
+
+    Sums are by `fsum`, because `sum` rounds in another way from Python 3.12 on.
+    """
+    factor: list[list[float]] = []
+    forward: list[float] = []
+    for row, value in zip(lower, right, strict=True):
+        found: list[float] = []
+        for element, other in zip(row, factor, strict=False):
+            found.append((element - math.fsum(map(mul, found, other))) / other[-1])
+        found.append(math.sqrt(max(row[-1] - math.fsum(map(mul, found, found)), 1e-300)))
+        factor.append(found)
+        forward.append((value - math.fsum(map(mul, found, forward))) / found[-1])
+    solution: list[float] = []
+    for row in reversed(factor):
+        value = forward.pop() / row[-1]
+        forward = [a - value * b for a, b in zip(forward, row, strict=False)]
+        solution.append(value)
+    return solution[::-1]

@@ -11,8 +11,8 @@ import numpy as np
 from pydantic import BeforeValidator, Field, TypeAdapter, model_validator
 
 from dxlrun import Angle, AngularVelocity, CommandModel, Floats, Length, LinearVelocity
-from dxlrun.tooling.robots import from_rpy
-from dxlrun_space.chain import Pose, Quaternion, Vector, compose, inverted, rotation_of, times, turned
+from dxlrun.tooling.robots import Transform, from_rpy, product
+from dxlrun_space.chain import Quaternion, Vector
 
 NORM: Final = 1e-3
 """Largest difference of a quaternion's length from 1: three decimals of each number."""
@@ -159,17 +159,15 @@ class PoseGoal(msgspec.Struct, frozen=True, array_like=True):
         """True if the goal has an orientation, absolute or relative."""
         return self.rotation is not None or self.turn[3] != 1.0
 
-    def target(self, frame: Pose, tip: Pose) -> Pose:
+    def target(self, frame: Transform, tip: Transform) -> Transform:
         """Return the goal pose in the base from the poses of the frame and of the tip at the start."""
-        back = inverted(frame[0])
-        x, y, z = (a - b for a, b in zip(tip[1], frame[1], strict=True))
-        present = turned(back, (x, y, z))
+        present = frame.inverse @ tip
         a, b, c = (
             (now if math.isnan(goal) else goal) + way
-            for now, goal, way in zip(present, self.place, self.way, strict=True)
+            for now, goal, way in zip(present.translation, self.place, self.way, strict=True)
         )
-        rotation = times(back, tip[0]) if self.rotation is None else rotation_of(self.rotation)
-        return compose(frame, (times(rotation_of(self.turn), rotation), (a, b, c)))
+        rotation = present.rotation if self.rotation is None else self.rotation
+        return frame @ Transform((a, b, c), product(self.turn, rotation))
 
 
 class TwistGoal(msgspec.Struct, frozen=True, array_like=True):

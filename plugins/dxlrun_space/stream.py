@@ -10,12 +10,12 @@ import math
 from collections.abc import Sequence
 from typing import Final
 
-from dxlrun_space.chain import Chain, Vector
+from dxlrun_space.chain import Vector
 from dxlrun_space.path import MotionLimits
-from dxlrun_space.solver import EXACT, normal_matrix, solve
+from dxlrun_space.solver import EXACT, Solver, normal_matrix, pulls, solve
 
 _ORIENTATION: Final = 0.03
-"""Weight of the orientation for arms that cannot keep all its turns, as a fraction of the length, m/rad."""
+"""Lever of the orientation for arms that cannot keep all its turns, as a fraction of the length."""
 _DAMPING: Final = 0.01
 """Damping, as a fraction of the length: 1 % of a joint's lever slows a motion by one part in ten thousand."""
 _STUCK: Final = 0.02
@@ -29,30 +29,19 @@ class TwistMotion:
     """Motion of a chain by twists.
 
     Args:
-        chain: The chain.
-        lower: Lowest position of each joint.
-        upper: Highest position of each joint.
+        solver: Solver with the chain and the limits of its joints.
         limits: Limits of joints and tip.
         exact: The arm can keep the orientation, so it counts as much as the position.
     """
 
-    def __init__(
-        self,
-        chain: Chain,
-        lower: Sequence[float],
-        upper: Sequence[float],
-        limits: MotionLimits,
-        *,
-        exact: bool,
-    ) -> None:
-        self._chain, self._limits = chain, limits
-        self._lower, self._upper = tuple(lower), tuple(upper)
-        self._weight = ((EXACT if exact else _ORIENTATION) * chain.length) ** 2
-        self._damping = (_DAMPING * chain.length) ** 2
+    def __init__(self, solver: Solver, limits: MotionLimits, *, exact: bool) -> None:
+        self._solver, self._chain, self._limits = solver, solver.chain, limits
+        self._lever = (EXACT if exact else _ORIENTATION) * self._chain.length
+        self._damping = (_DAMPING * self._chain.length) ** 2
         self.linear: Vector = (0.0, 0.0, 0.0)
         """Present velocity of the tip, m/s, within its acceleration limit."""
         self.angular: Vector = (0.0, 0.0, 0.0)
-        self._speeds = (0.0,) * len(chain.joints)
+        self._speeds = (0.0,) * len(self._chain.joints)
         self.held_by = -1
         """Index of the joint that holds the tip at its limit, or -1."""
 
@@ -68,13 +57,13 @@ class TwistMotion:
 
     def change_twist(self, linear: Vector, angular: Vector, period_s: float) -> None:
         """Bring the present velocity closer to a twist, within the limits of the tip."""
-        limits = self._limits
-        self.linear = _toward(
-            self.linear, _clamped(linear, limits.linear_velocity), limits.linear_acceleration * period_s
+        limits, rest = self._limits, (0.0, 0.0, 0.0)
+        linear, angular = (
+            _toward(rest, linear, limits.linear_velocity),
+            _toward(rest, angular, limits.angular_velocity),
         )
-        self.angular = _toward(
-            self.angular, _clamped(angular, limits.angular_velocity), limits.angular_acceleration * period_s
-        )
+        self.linear = _toward(self.linear, linear, limits.linear_acceleration * period_s)
+        self.angular = _toward(self.angular, angular, limits.angular_acceleration * period_s)
 
     def advance_joints(
         self, positions: Sequence[float], linear: Vector, angular: Vector, period_s: float
@@ -85,11 +74,9 @@ class TwistMotion:
         if self.rests:
             return tuple(positions)
         self._chain.pose(positions)
-        columns = self._chain.jacobian()
-        (x, y, z), (u, v, w) = self.linear, self.angular
-        weight = self._weight
-        right = [a * x + b * y + c * z + weight * (d * u + e * v + f * w) for a, b, c, d, e, f in columns]
-        speeds = solve(normal_matrix(columns, weight, self._damping), right)
+        columns = self._chain.jacobian(self._lever)
+        right = pulls(columns, self.linear, self.angular, self._lever)
+        speeds = solve(normal_matrix(columns, self._damping), right)
         return self.turn_joints(positions, speeds, period_s)
 
     def turn_joints(
@@ -111,7 +98,7 @@ class TwistMotion:
 
     def _highest(self, index: int, now: float, speed: float, period_s: float) -> float:
         """Return the speed at which a joint still stops at its limit, at most its own limit."""
-        left = self._upper[index] - now if speed > 0 else now - self._lower[index]
+        left = self._solver.upper[index] - now if speed > 0 else now - self._solver.lower[index]
         if left <= 0:
             return 0.0
         brake = self._limits.acceleration[index] / 2
@@ -129,16 +116,8 @@ def approach(way: Vector, acceleration: float, period_s: float) -> Vector:
     return x * scale, y * scale, z * scale
 
 
-def _clamped(vector: Vector, most: float) -> Vector:
-    length = math.hypot(*vector)
-    if length <= most:
-        return vector
-    x, y, z = vector
-    scale = most / length
-    return x * scale, y * scale, z * scale
-
-
 def _toward(now: Vector, goal: Vector, most: float) -> Vector:
+    """Return the point that is nearest to the goal, at most this far from the present one."""
     (x, y, z), (u, v, w) = now, goal
     length = math.hypot(u - x, v - y, w - z)
     if length <= most:

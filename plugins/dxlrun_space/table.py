@@ -33,10 +33,7 @@ def pose_table(rows: Sequence[Row]) -> Table:
         (Column("tip", "name"), "tip"),
         (Column("dexterity", form="{:.2f}"), "dexterity"),
         (Column("left to a limit", "name"), margin),
-        (
-            Column("turned off by", form="{:.1f} deg"),
-            off,
-        ),
+        (Column("turned off by", form="{:.1f} deg"), off),
     ]
     return Table.listing("Poses of tips (dexterity: 1 in all directions alike, 0 singular)", columns, rows)
 

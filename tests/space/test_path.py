@@ -45,7 +45,7 @@ def sampled(arm: Arm, path: Path, period_s: float = 0.005) -> tuple[Any, Any]:
     """Return joint positions each period, and the tip's positions."""
     count = math.ceil(path.duration_s / period_s)
     rows = np.array([path.sample(index * period_s).positions for index in range(count + 1)])
-    return rows, np.array([arm.chain.pose(row)[1] for row in rows.tolist()])
+    return rows, np.array([arm.chain.pose(row).translation for row in rows.tolist()])
 
 
 def assert_within(arm: Arm, rows: Any, tips: Any, period_s: float = 0.005) -> None:

@@ -15,7 +15,7 @@ from dxlrun import DxlrunError, RemoteRobot
 from dxlrun.compile.robot_compiler import compile_files
 from dxlrun.testing import plan_of
 from dxlrun.tooling.runs import VirtualLink
-from dxlrun_space import space_robot
+from dxlrun_space import reach, space_robot
 from dxlrun_space.space_robot import PoseRefused, SpaceRobot
 
 ROBOTS = Path(__file__).parents[2] / "robots"
@@ -123,7 +123,10 @@ def test_move_to_waits_for_the_pose_and_raises_what_refused_it(monkeypatch: pyte
 
 
 @pytest.mark.needs("report")
-def test_reach_draws_what_a_link_gets_to(dxlrun: Dxlrun, tmp_path: Path) -> None:
+def test_reach_draws_what_a_link_gets_to(
+    dxlrun: Dxlrun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reach, "POSTURES", 500)
     file, picture = ROBOTS / "koch_space.yaml", tmp_path / "reach.png"
     said = dxlrun("reach", file, "follower_hand", picture)
     assert (said.code, said.err) == (0, "")

@@ -15,7 +15,7 @@ from tests.kit.pages import page_text, shows
 from dxlrun.cli.steering import goals
 from dxlrun.testing import plan_of
 from dxlrun.tooling.runs import VirtualLink
-from dxlrun_space import space_robot
+from dxlrun_space import reach, space_robot
 
 ROBOTS = Path(__file__).parents[2] / "robots"
 NAME = "open_manipulator_x_space"
@@ -27,6 +27,7 @@ def test_page(dxlrun: Dxlrun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     (tmp_path / "robots").symlink_to(ROBOTS)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.setattr(reach, "POSTURES", 500)
     robot = space_robot.SpaceRobot(NAME, VirtualLink(plan_of(ROBOTS / f"{NAME}.yaml")))
     monkeypatch.setattr(goals, "connect_robot", lambda *_: nullcontext(robot))
     monkeypatch.setattr(space_robot.dxlrun, "connect", lambda *_: robot)

@@ -38,7 +38,12 @@ if TYPE_CHECKING:
     from dxlrun.description.reading import Description as Description
     from dxlrun.description.reading import Replacement as Replacement
     from dxlrun.description.reading import read_robot as read_robot
+    from dxlsim.geometry.transform import Transform as Transform
+    from dxlsim.geometry.transform import conjugate as conjugate
     from dxlsim.geometry.transform import from_rpy as from_rpy
+    from dxlsim.geometry.transform import product as product
+    from dxlsim.geometry.transform import rotated as rotated
+    from dxlsim.geometry.transform import rotation_about as rotation_about
     from dxlsim.geometry.urdf import Urdf as Urdf
     from dxlsim.geometry.urdf import UrdfJoint as UrdfJoint
     from dxlsim.geometry.urdf import read_urdf as read_urdf
