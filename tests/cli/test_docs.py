@@ -124,7 +124,7 @@ def test_links_and_files_of_a_page_exist(path: Path) -> None:
         assert linked.exists(), link
         if anchor:
             assert anchor in anchors(linked.read_text()), link
-    others = {"logs", ".venv", "dxlrun", "lights"}  # beginnings of other names, too
+    others = {"logs", ".venv", "dxlrun", "lights", "ros"}  # beginnings of other names, or of .ci/run
     folders = {one.name for root in ROOTS for one in root.iterdir() if one.is_dir()} - others
     typed = [word for line in re.findall(r"^    (.+)$", text, re.MULTILINE) for word in line.split()]
     for token in [*re.findall(r"`([\w.+-]+(?:/[\w.+-]+)*/?)`", text), *typed]:

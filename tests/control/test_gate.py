@@ -111,7 +111,7 @@ class Watched:
         # the goal: inside the limits or not further out, within the step, the nearest to its command
         assert np.isnan(start) or low <= goal <= high
         if np.isinf(self.acceleration):
-            np.testing.assert_equal(goal, nearest)
+            np.testing.assert_array_equal(goal, nearest)
         elif np.isfinite(start):
             self.check_acceleration(start, goal)
         self.speed = (goal - start) / dt if np.isfinite(start) else 0.0
@@ -122,7 +122,7 @@ class Watched:
             [BACK_SPEED * plan.slow_speed / SLOW_SPEED] if goal < plan.lower or goal > plan.upper else []
         )
         if not at_hand or moves:
-            np.testing.assert_equal(toward, np.fmin(known, min(limits, default=NAN)))
+            np.testing.assert_array_equal(toward, np.fmin(known, min(limits, default=NAN)))
         # the flags
         beyond = moves and plan.highest_speed < fast
         assert bool(clamped & Clamp.LOWER) == (moves and command < low)

@@ -125,7 +125,7 @@ def test_steps_of_the_policy_are_checked(tmp_path):
     with pytest.raises(InputError, match="on_overheat may take "):
         plan_of(file)
     file.write_text(ROBOT + OVERHEAT.replace("pose: rest", "pose: nest"))
-    with pytest.raises(InputError, match="pose nest of on_overheat is not defined; did you mean rest"):
+    with pytest.raises(InputError, match="the robot has no pose nest; did you mean rest"):
         plan_of(file)
 
 

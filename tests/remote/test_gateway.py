@@ -419,7 +419,7 @@ def test_the_page_gives_the_limits_that_are_kept():
 
 # Hostile bodies
 
-DEEP = b'{"positions":' + b'{"a":' * 900 + b"1" + b"}" * 901
+DEEP = b'{"positions":' + b'{"a":' * 20_000 + b"1" + b"}" * 20_001
 NINES = b"9" * 400
 
 

@@ -95,9 +95,8 @@ def _sent(columns: JointColumns, row: int, limits: PlannedJoint) -> _SentGoals:
         columns[name][row] for name in ("goal_position", "position", "goal_velocity")
     )
     given, valid = columns["torque"][row] == Torque.GIVEN, columns["valid"][row]
-    if (
-        given.any()
-    ):  # When torque is enabled, the servo holds its position; an earlier goal no longer applies.
+    # When torque is enabled, the servo holds its position; an earlier goal no longer applies.
+    if given.any():
         goal = np.where(given, np.nan, goal)
     if not valid.all():
         position = np.where(valid, position, np.nan)

@@ -481,7 +481,9 @@ def in_si(body: bytes, what: str, joints: Sequence[JointPlan] = ()) -> bytes:
     """
     try:
         data = msgspec.json.decode(body)
-    except (msgspec.MsgspecError, RecursionError) as error:
+    except RecursionError as error:
+        raise invalid(texts.BODY_TOO_DEEP) from error
+    except msgspec.MsgspecError as error:
         raise invalid(texts.not_json(what, error)) from error
     mistaken: dict[str, str] = {}
     plain = _plain(data, (), mistaken, _units_of(data, joints))
