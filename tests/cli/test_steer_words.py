@@ -42,6 +42,11 @@ def test_wrong_quantities_of_the_command_line_are_a_line_each_and_keep_their_cod
     assert WrittenEntry.from_words((), None).located(other) is other
 
 
+def test_a_quoted_word_can_have_several_pairs() -> None:
+    written = WrittenEntry.from_words(["x=0.2 y=-3 cm  rpy=0, 90 deg, 0", "frame=base"], None)
+    assert written.data == {"x": 0.2, "y": "-3 cm", "rpy": "0, 90 deg, 0", "frame": "base"}
+
+
 def test_list_shows_the_state_of_a_robot() -> None:
     info = {"name": "arm", "rate": 320.0, "paused": True, "cycles": 7, "skipped": 1, "log": "logs/arm.mcap"}
     assert headline(info) == "arm: 320 Hz, paused, 7 cycles, 1 period skipped, log logs/arm.mcap"

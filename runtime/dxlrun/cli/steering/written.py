@@ -6,6 +6,7 @@ them to numbers, because `positions=[60]` may be meant in deg or in rad.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,8 @@ from dxlrun.description.document import PlainDocument, grow, literal, parse, rea
 from dxlrun.errors import DxlrunError, InputError, Problem, Refused
 
 _WORDS = "command line"
+_NEXT_KEY = re.compile(r"\s+(?=[^\W\d][\w.]*=)")
+"""Space before the next pair of a word with several, such as "x=20cm y=0cm"."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,13 +29,17 @@ class WrittenEntry:
 
     @classmethod
     def from_words(cls, words: Sequence[str], file: Path | None) -> WrittenEntry:
-        """Read `key=value` words, or a file; raises InputError if both are given, and for invalid YAML."""
+        """Read `key=value` words, each with one pair or several, or a file.
+
+        Raises InputError if both are given, and for invalid YAML.
+        """
         if file is not None and words:
             raise InputError(f"{words[0]!r} and --file exclude each other; give the words, or the file")
         if file is not None:
             text, name = read_text(file), str(file)
         else:
-            text, name = "\n".join(map(_line, words)) or "{}", _WORDS
+            pairs = [pair for word in words for pair in _NEXT_KEY.split(word)]
+            text, name = "\n".join(map(_line, pairs)) or "{}", _WORDS
         try:
             written = cls(grow(parse(text, name), name, literal), in_words=file is None)
         except InputError as error:
