@@ -63,7 +63,7 @@ class SpaceRobot(RemoteRobot):
         Raises:
             PoseRefused: The pose is malformed or out of reach, or the motion did not end there.
             GoalTimeout: The motion has not ended within `timeout`.
-            DxlrunError: There is no such arm, or the robot is gone.
+            DxlrunError: The robot has no arm of this name, or is gone.
         """
         fields = {
             "pose": pose, "x": x, "y": y, "z": z, "dx": dx, "dy": dy, "dz": dz, "rpy": rpy, "drpy": drpy,

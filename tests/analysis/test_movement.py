@@ -43,7 +43,7 @@ def since_fault(position: Floats | float, before: Floats | float = behind(SWING)
 
 @dataclass
 class Joint:
-    """What a joint was to do, and what it did."""
+    """Goals of a joint, and its motion."""
 
     way: Floats = field(default_factory=lambda: SWING)
     position: Floats = field(default_factory=lambda: behind(SWING))

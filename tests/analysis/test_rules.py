@@ -1,4 +1,4 @@
-"""Rules of the verdict on totals: who may be accused, by which evidence, in which words. See totals.txt."""
+"""Rules of the verdict on totals: whom it may accuse, on what evidence and in what words; see totals.txt."""
 
 import ast
 import re

@@ -116,7 +116,7 @@ def test_servos_of_a_bus_that_is_back_are_looked_at_again_before_they_get_a_goal
         asks_model = bytes((one, 4, 2, 0)) if plan.protocol == 1.0 else bytes((one, 7, 0, 2, 0, 0))
         looks = [asks_model in packet for packet in since]
         goals = [one in (goals_in(packet, plan.protocol) or (0, []))[1] for packet in since]
-        assert True in looks[: goals.index(True)], "it got a goal before its model was read"
+        assert any(looks[: goals.index(True)]), "it got a goal before its model was read"
 
 
 @pytest.mark.parametrize("hears_stop", [True, False])

@@ -150,6 +150,7 @@ class Points(dxlrun.CommandModel):
 
 class Wait(dxlrun.CommandModel):
     seconds: float
+    pose: str | None = None
 
 
 class Whole(dxlrun.Controller[dxlrun.ParametersModel]):

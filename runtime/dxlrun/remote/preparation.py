@@ -10,6 +10,7 @@ import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from typing import get_args
 
 import msgspec
 import numpy as np
@@ -304,7 +305,8 @@ class Preparation:
         what = f"{kind} of {plan.name}"
         if units and _of_motions(kind, model):
             body = in_si(body, what, known.joints)
-        if "pose" in model.model_fields:
+        pose = model.model_fields.get("pose")
+        if pose is not None and str not in (pose.annotation, *get_args(pose.annotation)):
             body = self._with_pose(body, what)
         with plugin_code(plan.name, what, model):
             command = model.model_validate_json(body, strict=True)
