@@ -5,8 +5,6 @@ A find of a fixed run repeats itself: run the test again. A random search prints
     python -m pytest --hypothesis-profile=search tests/description
 """
 
-from __future__ import annotations
-
 import gc
 import os
 import re

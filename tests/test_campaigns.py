@@ -1,7 +1,5 @@
 """Campaigns: the mark `campaign` gives a test its count at each level, and a generator."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

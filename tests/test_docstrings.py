@@ -1,7 +1,5 @@
 """The examples in docstrings of what authors of plug-ins and of programs use run as they stand."""
 
-from __future__ import annotations
-
 import inspect
 import math
 import pkgutil

@@ -1,7 +1,5 @@
 """Names of the product's code: no bare verb, and one name for one thing. Each exemption has its reason."""
 
-from __future__ import annotations
-
 import ast
 from collections import defaultdict
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Prose: docstrings, comments, messages and pages contain none of the phrases below."""
 
-from __future__ import annotations
-
 import ast
 import io
 import re

@@ -1,7 +1,5 @@
 """The generated reference is that of the code, and the pages beside it are short."""
 
-from __future__ import annotations
-
 import pkgutil
 import re
 import subprocess

@@ -3,8 +3,6 @@
 These run where ziglang is installed (extra `release`), for a minute or two.
 """
 
-from __future__ import annotations
-
 import email
 import http.client
 import importlib

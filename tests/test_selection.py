@@ -1,7 +1,5 @@
 """Selection: long tests run where they are named, where all are asked for, or where a change needs them."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """The documentation site: it builds without a warning, no link is dead, no page scrolls sideways."""
 
-from __future__ import annotations
-
 import functools
 import http.server
 import re

@@ -1,7 +1,5 @@
 """The tests themselves: each has a time limit, draws the same examples at each run, and is in the sdist."""
 
-from __future__ import annotations
-
 import ast
 import os
 import re

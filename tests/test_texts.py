@@ -1,7 +1,5 @@
 """Tables of texts: each event has a row with code, severity and text in the `texts.py` of its room."""
 
-from __future__ import annotations
-
 import ast
 import inspect
 import string

@@ -1,7 +1,5 @@
 """The packages beside dxlrun fit the version of the tree that they are built from, and refuse another one."""
 
-from __future__ import annotations
-
 import email
 import json
 import os

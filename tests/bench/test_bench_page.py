@@ -1,7 +1,5 @@
 """The figures and commands of docs/explanation/bench.md are those of the program."""
 
-from __future__ import annotations
-
 import inspect
 import re
 import shlex

@@ -3,8 +3,6 @@
 How fast a host is decides nothing here.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The command of the exchange benchmark: its words, and its results as a table and as JSON."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """The measures of `house.py`, on sources that are made up."""
 
-from __future__ import annotations
-
 import house
 
 

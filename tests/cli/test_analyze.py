@@ -1,7 +1,5 @@
 """`dxlrun analyze`: which logs it reads, what it refuses, and where it writes a report."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

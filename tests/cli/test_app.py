@@ -1,7 +1,5 @@
 """The program as a whole: version, help, errors and exit codes, completion, streams."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

@@ -1,7 +1,5 @@
 """`dxlrun bench rate`: its words, and its result as JSON and in words."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Command lines and what they print: texts in this folder; `tests/kit/commands.py` has their form."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`dxlrun demo`: one command after an installation, without a clone."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from typing import Any

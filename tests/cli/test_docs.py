@@ -1,7 +1,5 @@
 """The pages of the repository: the commands, files, names and pages in them exist."""
 
-from __future__ import annotations
-
 import ast
 import json
 import re

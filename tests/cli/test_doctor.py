@@ -1,7 +1,5 @@
 """`dxlrun doctor` on made-up machines, the cases of doctor.txt, and on this one."""
 
-from __future__ import annotations
-
 import gzip
 import json
 import os

@@ -1,7 +1,5 @@
 """Tables at 80 columns, the width of a terminal: each command's, for each robot, stays a table."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from importlib.util import find_spec
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`dxlrun examples`: the robots that come along run where they are copied to, and those of gallery.md run."""
 
-from __future__ import annotations
-
 import re
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Tables that are wider than their terminal, and colours where there is no terminal."""
 
-from __future__ import annotations
-
 import io
 import json
 

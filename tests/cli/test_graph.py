@@ -1,7 +1,5 @@
 """The graph of controllers and its pictures; what `dxlrun check --graph` prints is in check.txt."""
 
-from __future__ import annotations
-
 import io
 from itertools import combinations
 from pathlib import Path

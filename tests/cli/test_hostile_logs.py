@@ -1,7 +1,5 @@
 """Logs are what people send each other: no verb executes what is in one, or leaves its own folder for it."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The envelope of --json: every command that has the option answers in it, refused or not."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

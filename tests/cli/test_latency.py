@@ -1,7 +1,5 @@
 """`dxlrun latency` on the command line: counts and structure, never times."""
 
-from __future__ import annotations
-
 import ctypes
 import os
 import resource

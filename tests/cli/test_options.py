@@ -1,7 +1,5 @@
 """Options have one name and one meaning in all commands: those of options.txt."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterator
 from importlib.util import module_from_spec, spec_from_file_location

@@ -4,8 +4,6 @@ A fresh interpreter runs a command line once as it is, so that the standard libr
 imported; then everything that only Linux has is taken away, dxlrun is imported again, and runs it again.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import select

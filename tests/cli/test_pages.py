@@ -3,8 +3,6 @@
 Where a page names hardware, the command gets a simulated line instead; a run gets virtual time.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import subprocess

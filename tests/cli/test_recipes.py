@@ -1,7 +1,5 @@
 """The programs of docs/how-to/recipes.md and the notebook, on simulated robots in this process."""
 
-from __future__ import annotations
-
 import builtins
 import csv
 import json

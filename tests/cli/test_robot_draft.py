@@ -1,7 +1,5 @@
 """A drafted robot file is one that compiles, for every model there is."""
 
-from __future__ import annotations
-
 import math
 from array import array
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """Runs at the terminal: what a run is asked for, its verdict, its log, its progress, its signals."""
 
-from __future__ import annotations
-
 import io
 import re
 import resource

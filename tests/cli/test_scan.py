@@ -1,7 +1,5 @@
 """`dxlrun scan`: a pseudo-terminal with simulated servos, judged by the ledger."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from collections.abc import Callable

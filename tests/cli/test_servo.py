@@ -1,7 +1,5 @@
 """`dxlrun servo` on a pseudo-terminal, the cases of servo.txt: judged by the simulated bus' ledger."""
 
-from __future__ import annotations
-
 import io
 import json
 import os

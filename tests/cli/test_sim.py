@@ -1,7 +1,5 @@
 """`dxlrun sim` as a person uses it: started, talked to by other programs, stopped."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

@@ -1,7 +1,5 @@
 """The words of `dxlrun sim`, its live table, and the letters that are typed below it."""
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Start-up: which modules a command imports; how long that takes is measured by bench/startup.py."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

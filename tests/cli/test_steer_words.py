@@ -1,7 +1,5 @@
 """Words: commands for a running robot when none runs, how they are read, and those of states."""
 
-from __future__ import annotations
-
 import io
 import json
 import re

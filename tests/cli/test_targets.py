@@ -1,7 +1,5 @@
 """Files that a user names for writing: what may be replaced, and what every verb refuses."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 from xml.etree.ElementTree import Element

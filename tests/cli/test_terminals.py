@@ -1,7 +1,5 @@
 """Narrow terminals, closed streams, full disks behind them, readers that leave: all of it in processes."""
 
-from __future__ import annotations
-
 import os
 import pty
 import re

@@ -5,8 +5,6 @@ A block with a title is saved as that file. A block without a language is what t
 `dxlrun stop`; LOG is the newest log. How dxlrun is installed is what `.ci/run` does.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import shlex

@@ -1,7 +1,5 @@
 """Runs that cannot be steered: `dxlrun list` names them, `dxlrun stop` ends them."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """Verbs that packages add, and the help that names all of them."""
 
-from __future__ import annotations
-
 import shlex
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What is said of a robot file or a motion, and where, and what it becomes: the cases of `cases/*.txt`."""
 
-from __future__ import annotations
-
 import pytest
 from tests.kit.cases import TextCase, case_parameters
 from tests.kit.robot_cases import check_case

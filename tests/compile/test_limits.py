@@ -1,8 +1,6 @@
 # ruff: noqa: E501 (a mistake and its sentence are read best side by side)
 """Limits and properties of joints, for motions, commands and clients: each side, each sign, and the bound itself."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math

@@ -1,7 +1,5 @@
 """Plans as JSON, of today and of earlier versions; what two files or two plans together decide; graphs."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

@@ -8,8 +8,6 @@ The order, and what reaches the servos, are computed here again, from the lists 
 from, by brute force and without a line of the runtime's graph. `cases/chains.txt` has each mistake alone.
 """
 
-from __future__ import annotations
-
 import random
 import re
 import struct

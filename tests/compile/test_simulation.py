@@ -1,7 +1,5 @@
 """Simulated servos that share joints or bodies, MuJoCo that is missing, and motor files."""
 
-from __future__ import annotations
-
 import importlib.util
 import math
 import sys

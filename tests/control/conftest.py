@@ -1,7 +1,5 @@
 """A robot of a few joints without servos, whose controllers are written in the tests."""
 
-from __future__ import annotations
-
 import pytest
 from tests.kit.loops import Robot
 

@@ -1,7 +1,5 @@
 """Random graphs of controllers, switched while some of them fail: the invariants of every cycle."""
 
-from __future__ import annotations
-
 import random
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Chains: controllers that command the references of others in the same cycle, or provide states."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

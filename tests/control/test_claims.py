@@ -1,7 +1,5 @@
 """Claims: what two controllers may not have both, what leaves and enters; and the order of updates."""
 
-from __future__ import annotations
-
 import random
 from dataclasses import dataclass
 from itertools import permutations

@@ -1,7 +1,5 @@
 """Goals of several joints: each joint counts by its own tolerance, and only joints of the goal count."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

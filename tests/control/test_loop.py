@@ -1,7 +1,5 @@
 """The schedules of a loop, their accounting, and every way in which a loop ends."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Monitors of the loop: which are built, and how they act."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Self

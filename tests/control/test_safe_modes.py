@@ -1,7 +1,5 @@
 """The end of a run whose joints are not in position mode: they rest before a pose, and never turn on."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Registers of a servo that limit its goals: what they take off counts as a clamp, and is named."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Topics of controllers: what they publish reaches the sink as it is, or is their fault in one sentence."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,8 +1,6 @@
 # ruff: noqa: E501 (a file and its sentence are read best side by side)
 """The page of robot files and the schema say what the program does; files of other programs are one sentence."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterator

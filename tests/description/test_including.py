@@ -1,8 +1,6 @@
 # ruff: noqa: E501 (a mistake and its sentence are read best side by side)
 """What is put into robot files: arguments, fragments, groups and defaults, each value with its place."""
 
-from __future__ import annotations
-
 import functools
 import json
 from pathlib import Path

@@ -1,8 +1,6 @@
 # ruff: noqa: E501 (a mistake and its sentence are read best side by side)
 """Motions and motor files in SI units; `cases/motion_form.txt` and `motor_form.txt` have the mistakes."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

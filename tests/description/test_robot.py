@@ -1,8 +1,6 @@
 # ruff: noqa: E501 (a mistake and its sentence are read best side by side)
 """Robot files in SI units, what is left out, values that replace others, and problems in our words."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Annotated, Literal

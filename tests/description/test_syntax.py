@@ -1,8 +1,6 @@
 # ruff: noqa: E501 (a mistake and its sentence are read best side by side)
 """YAML 1.2: scalars, and mistakes of syntax at their places."""
 
-from __future__ import annotations
-
 import math
 import os
 import re

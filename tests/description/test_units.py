@@ -1,6 +1,4 @@
 # ruff: noqa: E501 (a mistake and its sentence are read best side by side)
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable

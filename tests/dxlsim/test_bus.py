@@ -1,7 +1,5 @@
 """The line and its adapter: when bytes are handed over, in what pieces, and what happens on the way."""
 
-from __future__ import annotations
-
 import ctypes
 import signal
 import weakref

@@ -18,8 +18,6 @@ themselves. Expressions have the functions of `math`; of servo 1 `angle` and `sp
 newest reply), and `received` (bytes of the newest answers).
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Faults: their lines of text, those of chance, storms of them; dialogues/faults.txt has the others."""
 
-from __future__ import annotations
-
 import random
 from collections import Counter
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Replies that are sent ahead, and goals that compiled code executes: as those one by one, and by Python."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Callable
 

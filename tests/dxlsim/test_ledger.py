@@ -1,7 +1,5 @@
 """The ledger of a bus: what was entered is in its file, whatever becomes of the disk."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """dxlsim as a library: what it imports, its face, its examples, its fixture and its program."""
 
-from __future__ import annotations
-
 import contextlib
 import doctest
 import io

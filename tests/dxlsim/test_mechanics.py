@@ -1,7 +1,5 @@
 """Motor, load, control law and trajectory of simulated servos, against paper and pencil."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Servos of both protocols on one line: why a bus has one protocol (docs/explanation/bus.md)."""
 
-from __future__ import annotations
-
 import pytest
 from tests.kit.campaigns import campaign
 from tests.kit.mixed_line import MixedBus

@@ -3,8 +3,6 @@
 What a model has comes from its control table; what a servo may do with it is stated here once more, by hand.
 """
 
-from __future__ import annotations
-
 import fnmatch
 from collections.abc import Iterator
 

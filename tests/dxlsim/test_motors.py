@@ -4,8 +4,6 @@ The reference is worked out here, from BAM's equations and from the parameters o
 simplest (M1: Coulomb and viscous friction) and the fullest (M6). The simulation has those of a third, M3.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Packets among noise and however they are cut, and whatever a host sends; dialogues/manual.txt has more."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import pytest

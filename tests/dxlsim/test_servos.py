@@ -1,7 +1,5 @@
 """What a dialogue cannot say of simulated servos and devices: settings, rates, delays, what they measure."""
 
-from __future__ import annotations
-
 import math
 import struct
 

@@ -1,7 +1,5 @@
 """Reading a URDF: what it says, and every mistake at its line and column."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """The exchange of dxlwire alone, back to back, and how its replies are slept and polled for."""
 
-from __future__ import annotations
-
 import ctypes
 import os
 import threading

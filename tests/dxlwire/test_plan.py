@@ -1,7 +1,5 @@
 """Plans of buses, units of joints, lines that go and come back, and the face of dxlwire."""
 
-from __future__ import annotations
-
 import ast
 import contextlib
 import doctest

@@ -1,7 +1,5 @@
 """A simulated bus in a process of its own."""
 
-from __future__ import annotations
-
 import pytest
 from tests.kit.bus_process import simulated_lines
 

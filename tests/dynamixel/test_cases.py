@@ -1,7 +1,5 @@
 """Servos whose registers differ, that fail, are lost and return: the cases of `cases/*.txt`."""
 
-from __future__ import annotations
-
 import re
 
 import pytest

@@ -1,7 +1,5 @@
 """Devices in the exchange, also in storms, and parts of features on a bus; the simulated ledger judges."""
 
-from __future__ import annotations
-
 import math
 import struct
 from functools import partial

@@ -1,7 +1,5 @@
 """The compiled kernel does what the parser does, whatever arrives; goals by the rules of one servo."""
 
-from __future__ import annotations
-
 import math
 import os
 import re

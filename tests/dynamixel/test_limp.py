@@ -1,7 +1,5 @@
 """What the guardian does when the loop died, owed replies, and late, doubled and lost ones in pairs."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import random

@@ -1,7 +1,5 @@
 """Servo models that a plug-in brings along: found by every process of a run, refused in one sentence."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

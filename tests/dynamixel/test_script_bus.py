@@ -1,7 +1,5 @@
 """A script on simulated servos: what `Bus` sends, by the ledger, and what it refuses."""
 
-from __future__ import annotations
-
 import asyncio
 import copy
 import itertools

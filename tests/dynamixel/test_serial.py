@@ -1,7 +1,5 @@
 """Serial and simulated ports: their latency timers, deadlines, and pyserial's and the maker's way to them."""
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import os

@@ -1,7 +1,5 @@
 """Start of the hardware and its inspections; hardware errors of every model, named as in its manual."""
 
-from __future__ import annotations
-
 import itertools
 from contextlib import suppress
 from functools import partial

@@ -2,8 +2,6 @@
 than a tick, no joint moves at the start, limits hold, also after a reboot within the run and a power cycle.
 """
 
-from __future__ import annotations
-
 import math
 import random
 from collections.abc import Iterator

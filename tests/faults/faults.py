@@ -16,8 +16,6 @@ is applied to this checkout, which must be clean and installed with `pip install
 end. Its tests are the short ones that execute it, or those of its room (tests/faults/trials.py).
 """
 
-from __future__ import annotations
-
 import argparse
 import signal
 import sys

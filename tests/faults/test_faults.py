@@ -1,7 +1,5 @@
 """Faults: a block of the lists has its parts, and is applied only where it fits."""
 
-from __future__ import annotations
-
 import gc
 import time
 from pathlib import Path

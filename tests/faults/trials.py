@@ -10,8 +10,6 @@ A fault in C, or outside of functions, has a pytest of its own. A test that fail
 not found it, and what takes longer than the limit finds nothing: nobody would wait for it.
 """
 
-from __future__ import annotations
-
 import ast
 import gc
 import inspect

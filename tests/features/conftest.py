@@ -1,7 +1,5 @@
 """Projects of packages of strangers, as a user would write them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Features: the registry, its files and processes, plans of earlier versions, and units of states."""
 
-from __future__ import annotations
-
 import base64
 import json
 import re

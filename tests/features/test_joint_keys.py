@@ -1,7 +1,5 @@
 """A key of joints of a foreign package: that of the page add-a-section.md, checked, executed and shown."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A package with a policy of its own, the example of add-a-section.md, on virtual time."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A key of servos of a foreign package: in every form of a servo, written at the start and after a reboot."""
 
-from __future__ import annotations
-
 import re
 import sys
 from collections.abc import Callable, Iterator

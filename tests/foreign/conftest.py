@@ -4,8 +4,6 @@ Each test takes a bus of its own, so that one process serves a whole module and 
 servos. What the servos refused is read from the ledger in the end, and must be what the tests expected.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple

@@ -3,8 +3,6 @@
 A terminal has the rate that a host gives it, and servos at another one hear nothing.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

@@ -1,7 +1,5 @@
 """The maker's newer Python interface (dynamixel_easy_sdk), which brings control tables of its own."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from typing import Any
 

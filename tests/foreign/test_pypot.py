@@ -4,8 +4,6 @@ pypot is under the GPL: it runs as a program of its own, and nothing here import
 with the goals, with bit 10 set for joints that are `indirect`.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import subprocess

@@ -1,7 +1,5 @@
 """rustypot's Python classes, written in Rust for other robots, with control tables of their own."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from typing import Any
 

@@ -3,8 +3,6 @@
 Its group for bulk reads raises TypeError in this protocol: the two halves of it are called instead.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

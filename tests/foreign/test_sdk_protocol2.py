@@ -4,8 +4,6 @@ The SDK is asked only where it is right: it stuffs nothing that it sends, and lo
 servo is silent.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 from dynamixel_sdk import COMM_SUCCESS, GroupBulkRead, GroupBulkWrite, GroupSyncRead, GroupSyncWrite

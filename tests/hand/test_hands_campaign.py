@@ -6,8 +6,6 @@ is judged byte by byte but for the values, and the values by the servos. CI runs
     pytest --campaign=release tests/hand/test_hands_campaign.py
 """
 
-from __future__ import annotations
-
 import math
 import random
 import re

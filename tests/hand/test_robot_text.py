@@ -1,7 +1,5 @@
 """Values that are replaced in a robot file: every other byte is as it was."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

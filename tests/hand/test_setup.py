@@ -1,7 +1,5 @@
 """Dialogues with a scripted hand on simulated servos and virtual time, most of them texts; finding a port."""
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Callable, Iterable

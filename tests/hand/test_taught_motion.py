@@ -1,7 +1,5 @@
 """Recordings of a hand: trimmed, smoothed, slowed, and joined with poses."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from pathlib import Path

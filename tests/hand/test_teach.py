@@ -1,7 +1,5 @@
 """`dxlrun teach`: a scripted hand shows a motion to a robot that runs."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from pathlib import Path

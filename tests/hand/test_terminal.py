@@ -1,7 +1,5 @@
 """The dialogues at a terminal: the commands of docs/how-to/by-hand.md, Ctrl-C, and what is not a terminal."""
 
-from __future__ import annotations
-
 import re
 import shlex
 import sys

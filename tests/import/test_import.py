@@ -1,7 +1,5 @@
 """Files of other programs: texts in this folder have the files, the commands, and what they print."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

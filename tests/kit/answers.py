@@ -1,7 +1,5 @@
 """The envelope of every answer of a command with --json, as commands.md has it."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import msgspec

@@ -3,8 +3,6 @@
 This is the only place with deadlines: a shorter one in a test fails on a busy machine alone.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from typing import TypeVar

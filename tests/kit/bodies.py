@@ -1,7 +1,5 @@
 """Pendulums for the plants of simulated servos: a weight at the end of each arm, as a URDF and as a load."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

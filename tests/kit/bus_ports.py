@@ -1,7 +1,5 @@
 """Ports in Python, for a line of two buses, a bus that is held back, or a clock that stalls."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

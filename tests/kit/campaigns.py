@@ -14,8 +14,6 @@ the test and its parameters.
 A count of 0 leaves the test out at that level.
 """
 
-from __future__ import annotations
-
 import random
 from collections.abc import Callable, Iterator
 from enum import StrEnum

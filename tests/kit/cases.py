@@ -14,8 +14,6 @@ second change of a robot file does. The runner of a text describes its words. It
 place of that line, FILE:LINE.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple

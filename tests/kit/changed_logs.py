@@ -5,8 +5,6 @@
 A change maps the log that was read to the log that is written.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Runs of robot files on virtual time: by the commands in the motion files, or steered by a client."""
 
-from __future__ import annotations
-
 import math
 import shlex
 from collections.abc import Callable, Sequence

@@ -20,8 +20,6 @@ A text that begins with `# Each command is a case` has no blank lines between th
 A stage adds lines of its own to a text: what is given before a command, and what is asked after it.
 """
 
-from __future__ import annotations
-
 import functools
 import json
 import re

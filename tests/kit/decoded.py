@@ -1,7 +1,5 @@
 """Logs as other programs read them, and packets of a batch as a log has them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """A desk: files are written into the working directory and read; problems come as text without the folder."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from pathlib import Path
 

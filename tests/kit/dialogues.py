@@ -17,8 +17,6 @@ A hand may `turn` a servo, `connect` some of them by their order and no others, 
 Expected is one of `CHECKS`; `...` stands for any text, and FILE for the path of the robot file.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable

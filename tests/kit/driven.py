@@ -1,7 +1,5 @@
 """A robot on virtual time whose client does something each 20 ms, and the goals that its servos were sent."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 

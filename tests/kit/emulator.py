@@ -8,8 +8,6 @@ has a JSON line for each instruction and for each write to torque or goal: `t_ns
 ("instruction", "torque" or "goal"), `servo` and `value`.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import pty

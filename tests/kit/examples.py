@@ -1,7 +1,5 @@
 """Examples as parameters of tests: those that need an extra are marked with it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from pathlib import PurePath
 from typing import Any

@@ -9,8 +9,6 @@ Each test runs for each way to read four servos: single reads, a bulk read, a sy
 `Host` runs a cycle of reads with replies that the test made, and shows whose data it took and what it logged.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import ClassVar

@@ -1,7 +1,5 @@
 """Experiments: one that plays what it is given, and the commands of the pages."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Fuzzed requests on a port of HTTP: ones that command something, mutants of them in whole frames, noise."""
 
-from __future__ import annotations
-
 import os
 import random
 import re

@@ -1,7 +1,5 @@
 """Hands: scripts that answer dialogues, and simulated servos that they connect and turn."""
 
-from __future__ import annotations
-
 import os
 import select
 import subprocess

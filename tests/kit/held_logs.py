@@ -1,7 +1,5 @@
 """Logs that a run is writing, or did not finish, as far as other programs can tell."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 from collections.abc import Iterator

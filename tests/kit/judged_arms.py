@@ -1,7 +1,5 @@
 """Arms of the example robots, with forward kinematics of our own: matrices from the XML of the URDF."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import cached_property

@@ -7,8 +7,6 @@ has a cause when such a fault of its bus lasts, or ended not longer than two sec
 behind a silent one lose their replies with it.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Stories of the standard controllers: each with its keys, and what servos, clients and others do to it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pkgutil import resolve_name

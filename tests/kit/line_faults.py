@@ -1,7 +1,5 @@
 """Faults of single packets on a simulated bus, another host on its line, and a hand at a shaft."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 
 from dxlsim.bus.simulated_bus import DisturbedReply, PacketFault, SimulatedBus

@@ -4,8 +4,6 @@ The fixture `start` starts runs, and ends what a test leaves. `together` checks 
 they mostly wait.
 """
 
-from __future__ import annotations
-
 import itertools
 import os
 import signal

@@ -1,7 +1,5 @@
 """Modules that lie in no package: scripts beside the code."""
 
-from __future__ import annotations
-
 import importlib.util
 from pathlib import Path
 from types import ModuleType

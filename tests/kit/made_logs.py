@@ -1,7 +1,5 @@
 """Logs of runs that are known to the last number."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """A line with servos of both protocols: two simulated buses, which also receive what the other one sends."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from dxlsim.bus.ledger import Ledger

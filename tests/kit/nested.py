@@ -1,7 +1,5 @@
 """Pytest on made-up files in this process, with the conftest of this suite."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import os

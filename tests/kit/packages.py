@@ -1,7 +1,5 @@
 """Packages of strangers, installed as pip would leave them."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Packets put together by hand: nothing of the runtime's or of the simulation's packet code is used."""
 
-from __future__ import annotations
-
 
 def _crc_of(value: int) -> int:
     for _ in range(8):

@@ -1,7 +1,5 @@
 """The pages of the documentation; their names are unique, so a test names a page and not its folder."""
 
-from __future__ import annotations
-
 import re
 import shlex
 from pathlib import Path

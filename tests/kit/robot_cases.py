@@ -19,8 +19,6 @@ The path of a fact starts at one of ROOTS. An entry of a list is found by its na
 field gives the field of each entry. A number is compared in all digits that are written, and may have a unit.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import re

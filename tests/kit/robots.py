@@ -1,7 +1,5 @@
 """Robot files: texts, and what becomes of them; files are written into the working directory."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from textwrap import dedent
 

@@ -1,7 +1,5 @@
 """A robot file on virtual time: clients ask at times, faults happen, the shafts of all joints are sampled."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path

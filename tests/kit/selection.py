@@ -11,8 +11,6 @@ tests that a change can break:
 How a run ends, and what the network is refused, is never marked as long: tests of safety always run.
 """
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Collection, Generator, Iterable, Iterator

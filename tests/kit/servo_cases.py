@@ -21,8 +21,6 @@ that had none before, and nothing was written, or a line says that torque was sw
 written. The ledger of the simulated bus and the simulated servos are the judges.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable, Sequence

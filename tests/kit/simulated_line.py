@@ -1,7 +1,5 @@
 """A host of a few lines that talks to a simulated bus on virtual time; its packets are made by hand."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 from tests.kit.packets import crc, packet1, packet2

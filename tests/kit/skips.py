@@ -1,7 +1,5 @@
 """Skips: what may be skipped in CI; with `--strict-skips` others fail a run."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Generator
 

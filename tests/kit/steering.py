@@ -16,8 +16,6 @@ Requests of a step are separated by `;`, and are done where nothing else is said
 `CHECKS` have all forms. A controller of the type `scripted` commands what is commanded of it, else `own`.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Callable

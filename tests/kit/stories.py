@@ -1,7 +1,5 @@
 """Stories: what clients ask of a robot on virtual time, cycle by cycle, and the replay of such a run."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path

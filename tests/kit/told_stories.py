@@ -26,8 +26,6 @@ equal to its replay. `needs physics` names an extra. A case may have several run
 `NAME` stands for one text after the other.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import re

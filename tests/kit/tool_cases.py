@@ -4,8 +4,6 @@ A case begins with `tool:` or `line:`. What a step did or found has a line `=> d
 refused `=> refused: ...`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import partial

@@ -1,7 +1,5 @@
 """A simulated torso with an IMU in a process of its own, and what its servos were sent."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """What the analysis counts of a log."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from dxlrun import open_log

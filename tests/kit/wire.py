@@ -3,8 +3,6 @@
 Addresses and units too are those of FACTS, from the e-Manual, and not the runtime's.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Literal, NamedTuple

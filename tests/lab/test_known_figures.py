@@ -1,7 +1,5 @@
 """Figures of made-up recordings, whose numbers are known exactly; and a rig that leaves a pause as it was."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A robot with a gear, two servos on a hip, a gripper that slides, and a differential wrist."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """States and goals between servos and joints, and what moves them in the plan and in its simulation."""
 
-from __future__ import annotations
-
 import math
 from itertools import pairwise
 

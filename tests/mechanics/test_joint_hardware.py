@@ -1,7 +1,5 @@
 """Requests for joints of several servos, and layers between joints and servos."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A fresh environment with dxlrun and the example, as a stranger gets them from an index."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

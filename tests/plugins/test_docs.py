@@ -1,7 +1,5 @@
 """controllers.md, typed as it stands: its commands and its excerpts."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A stranger's package works beside dxlrun in an environment that has never seen this repository."""
 
-from __future__ import annotations
-
 import ast
 import re
 import shutil

@@ -1,7 +1,5 @@
 """Listening: what the client makes of answers, and a whole run whose messages come live and into the log."""
 
-from __future__ import annotations
-
 import asyncio
 import signal
 import socket

@@ -9,8 +9,6 @@ Each text is a robot file and, behind `====`, a request a line, whose robot is a
 That is the HTTP status, the code, and a part of the sentence, or the controller or `loop`, and what it gets.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterator

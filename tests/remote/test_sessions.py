@@ -11,8 +11,6 @@ What is not a request happens to the robot: see `HAPPENINGS`. Commands are done 
 answered as `loop answers` has it: a completion, or a refusal with its code.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import re

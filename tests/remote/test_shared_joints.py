@@ -1,7 +1,5 @@
 """Joints with several servos and linear joints, as clients name and command them."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

@@ -1,7 +1,5 @@
 """Live topics at the gateway: what a stream has and what a client misses; and frames of a running robot."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Arms of XM430 led by the standard controllers, alone and in chains: how they follow, and their limits."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Each robot file with each of its motions: it compiles, it runs, it is where the motion wants it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

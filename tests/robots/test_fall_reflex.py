@@ -1,7 +1,5 @@
 """The fall reflex of robots/fall_reflex.yaml: when it acts, what leaves on the bus, and its replay."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from pathlib import Path

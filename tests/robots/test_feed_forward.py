@@ -3,8 +3,6 @@
 `bench/feed_forward.py` prints the table of the docs; here are its bounds.
 """
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

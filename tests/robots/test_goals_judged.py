@@ -1,7 +1,5 @@
 """A servo that shuts itself down where its goal is judged; other goals are told in `stories`."""
 
-from __future__ import annotations
-
 import re
 
 import pytest

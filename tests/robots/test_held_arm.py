@@ -3,8 +3,6 @@
 `pytest --campaign=release -rP tests/robots/test_held_arm.py` prints the figures of the documentation.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

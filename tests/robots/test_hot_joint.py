@@ -5,8 +5,6 @@ tests/robots/test_hot_joint.py` has ten minutes from cold ones on, also for serv
 half as far as the simulation's.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

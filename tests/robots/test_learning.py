@@ -5,8 +5,6 @@ CI has a slow loop and few runs. The full one, ten repetitions of the thesis' wh
     pytest --campaign=release tests/robots/test_learning.py -rA
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from pathlib import Path

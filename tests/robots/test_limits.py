@@ -1,7 +1,5 @@
 """Limits of velocity, and of joints that follow efforts or velocities, judged by simulated shafts."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from functools import partial

@@ -4,8 +4,6 @@ CI looks at the drift of 8 virtual seconds; `pytest --campaign=release tests/rob
 at that of ten minutes.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from pathlib import Path

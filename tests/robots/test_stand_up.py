@@ -1,7 +1,5 @@
 """docs/examples/stand_up.py: robots/stand_up.yaml, pushed as in recipes.md, gets up and walks again."""
 
-from __future__ import annotations
-
 import math
 import re
 import runpy

@@ -1,7 +1,5 @@
 """Examples that are steered: odometry, followers and sums of references, against closed forms."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

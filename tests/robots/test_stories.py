@@ -1,7 +1,5 @@
 """Robots on virtual time by the texts in `stories`; `tests/kit/told_stories.py` has the form of a story."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

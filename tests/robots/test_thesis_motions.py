@@ -1,7 +1,5 @@
 """The thesis' experiments on virtual time: steps of Figures 19 and 20, and the tracking motion."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

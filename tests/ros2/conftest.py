@@ -1,7 +1,5 @@
 """What ROS programs see of a robot is judged in a ROS environment of its own."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

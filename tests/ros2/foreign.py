@@ -4,8 +4,6 @@ It is run by a Python of a ROS environment, and needs rclpy and the packages of 
 Lines and answers are JSON.
 """
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import itertools

@@ -1,7 +1,5 @@
 """Robots, their bridges and foreign ROS programs, each a process; what simulated servos were sent."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """The message packages of the bridge: their definitions, and the hashes by which ROS 2 tells types apart."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from types import ModuleType

@@ -1,7 +1,5 @@
 """docs/how-to/ros2.md, and the command line of the bridge: what they name is there."""
 
-from __future__ import annotations
-
 import re
 import shlex
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Trajectories of ROS 2 as the bridge takes them: judged in the Python of a ROS environment."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """Restarts of either side, and frames compared with pinocchio."""
 
-from __future__ import annotations
-
 import math
 import random
 import signal

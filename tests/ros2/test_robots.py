@@ -1,7 +1,5 @@
 """A base in a namespace and an arm with a gripper at once: neither gets what is for the other one."""
 
-from __future__ import annotations
-
 import signal
 from typing import Any, NamedTuple
 

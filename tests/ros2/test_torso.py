@@ -1,7 +1,5 @@
 """The torso by foreign ROS programs, as ros2_control's clients are written; judged by the servos' ledger."""
 
-from __future__ import annotations
-
 import math
 import signal
 from collections.abc import Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Fixtures of runs: real ones of tests/kit/live_run.py, and what controllers do in their updates."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

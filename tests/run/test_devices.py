@@ -1,7 +1,5 @@
 """Boards and devices on the buses of a robot: the log is the ledger, what they measure, what is refused."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

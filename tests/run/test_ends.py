@@ -1,7 +1,5 @@
 """Ways out of a run: the cases of ends.txt, judged by ledger, processes and log."""
 
-from __future__ import annotations
-
 import os
 import re
 import signal

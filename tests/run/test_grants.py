@@ -1,7 +1,5 @@
 """What the operating system granted: a table on a terminal, remarks elsewhere, all of it in the log."""
 
-from __future__ import annotations
-
 import io
 import os
 import signal

@@ -1,7 +1,5 @@
 """The guardian on Protocol 2.0: the arm is limp after its loop was killed; judged by the ledger."""
 
-from __future__ import annotations
-
 import os
 import signal
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Halt on virtual time: joints in every mode come to a stop within their limits, by the ledger."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from tests.kit.sampled_run import SampledRun

@@ -1,7 +1,5 @@
 """The search for the highest rate that a robot keeps, on virtual time."""
 
-from __future__ import annotations
-
 import pytest
 from msgspec.structs import replace
 

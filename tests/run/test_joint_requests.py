@@ -1,7 +1,5 @@
 """A reboot in a whole run on virtual time, and its verdict; other requests: stories/requests.txt."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from tests.kit.sampled_run import SampledRun

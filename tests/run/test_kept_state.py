@@ -1,7 +1,5 @@
 """Kept state: what a controller keeps in one run it has in the next; whatever ends, a file is old or new."""
 
-from __future__ import annotations
-
 import errno
 import os
 import random

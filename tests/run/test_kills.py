@@ -1,7 +1,5 @@
 """Campaign: kill -9 of a process of a run at a random moment, judged by the simulated bus' ledger alone."""
 
-from __future__ import annotations
-
 import os
 import random
 import signal

@@ -1,7 +1,5 @@
 """When a joint is lost, and what the monitor of lost servos does; whole runs: stories/lost_servos.txt."""
 
-from __future__ import annotations
-
 import pytest
 
 from dxlrun.channels.cycle import States

@@ -1,7 +1,5 @@
 """Runs of both protocols whose controllers change the modes of their servos: wire, log and joints."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """A log's name is taken before anything is written: two runs in one second, and directories that refuse."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import os

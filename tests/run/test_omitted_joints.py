@@ -1,7 +1,5 @@
 """Runs without a joint: its servos get no packet, and nothing changes for the other joints."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -6,8 +6,6 @@ Afterwards nothing of the run is left but processes that are stopped, or that wa
 for which the kernel let emulator, survivors or this process wait for a processor. Each pair prints both.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """Each policy on each trigger, judged by what the simulated servos were sent."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import re

@@ -1,7 +1,5 @@
 """The guardian makes a robot safe whose loop is gone: in one process; whole runs are in ends.txt."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

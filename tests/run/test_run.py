@@ -1,7 +1,5 @@
 """A whole run through all processes: what it opens, its output, and what it refuses; see also ends.txt."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 import signal

@@ -1,7 +1,5 @@
 """A sensor stops, sends NaN, its process is killed: what the loop's end of its slot makes of it."""
 
-from __future__ import annotations
-
 import os
 import pty
 import re

@@ -1,7 +1,5 @@
 """Runs in real time whose processes have no processor for a while: judged by states, events and the log."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

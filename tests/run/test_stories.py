@@ -1,7 +1,5 @@
 """Joints that are lost, limp or moved by hand, by the texts in `stories`; see tests/kit/told_stories.py."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -10,8 +10,6 @@ return: a pause, a line or a requested reboot of other joints; all else of a gea
 Protocol 1.0; a request of pairs.
 """
 
-from __future__ import annotations
-
 import itertools
 import json
 import math

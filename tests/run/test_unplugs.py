@@ -6,8 +6,6 @@ and all servos end limp: by the loop, by the guardian when the loop is killed, o
 when both are.
 """
 
-from __future__ import annotations
-
 import os
 import random
 import re

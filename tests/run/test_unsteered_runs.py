@@ -1,7 +1,5 @@
 """`dxlrun stop` and `dxlrun list` on real runs without a gateway, of one name, and at their start and end."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

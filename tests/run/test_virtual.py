@@ -1,7 +1,5 @@
 """Runs on virtual time: the torso by its formulas, steered and disturbed; two of one seed, every model."""
 
-from __future__ import annotations
-
 import math
 from math import cos, pi, sin
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The rules of watching, without processes: what counts as standing still, and what a wish to stop does."""
 
-from __future__ import annotations
-
 import io
 import os
 import select

@@ -1,7 +1,5 @@
 """Every standard controller that takes positions: a joint with `wrap: true` goes the shorter way."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import math

@@ -1,7 +1,5 @@
 """A crane of two servos with a URDF, and sensors on it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Slots, and what the loop makes of their samples: values, validity, age, and an event where that changes."""
 
-from __future__ import annotations
-
 import fcntl
 import math
 import os

@@ -1,7 +1,5 @@
 """serial_imu over a pseudo-terminal, and the page of sensors."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

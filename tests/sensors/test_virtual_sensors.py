@@ -1,7 +1,5 @@
 """Sensors on a simulated body: judged by MuJoCo's own sensors, in virtual runs and their replays."""
 
-from __future__ import annotations
-
 import math
 import re
 from pathlib import Path

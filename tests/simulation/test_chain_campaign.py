@@ -9,8 +9,6 @@ campaign, of 5 s each:
     pytest --campaign=release tests/simulation/test_chain_campaign.py
 """
 
-from __future__ import annotations
-
 import json
 import random
 from collections.abc import Callable, Sequence

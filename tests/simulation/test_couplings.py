@@ -1,7 +1,5 @@
 """Joints with gears, slides, several servos and transmissions: judged by mechanics worked out by hand."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """The judges of runs with faults can fail: without one byte, one cause or one event."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

@@ -8,8 +8,6 @@ full campaign before a release, 30 s of the robots' time each:
     pytest --campaign=release tests/simulation/test_faults_campaign.py
 """
 
-from __future__ import annotations
-
 import json
 import math
 import random

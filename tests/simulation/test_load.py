@@ -1,7 +1,5 @@
 """What a servo moves: bodies of a URDF in MuJoCo, felt through its registers and worked out by hand."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """The process of simulated buses: terminals that hosts open, and lines of JSON with its starter."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import random

@@ -1,7 +1,5 @@
 """A recorded bus: a host that does the same hears the same; another one reads registers that are known."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """A process of simulated servos that is stopped for a while, or answers late on purpose, and its host."""
 
-from __future__ import annotations
-
 import os
 import signal
 import threading

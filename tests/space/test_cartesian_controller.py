@@ -1,7 +1,5 @@
 """cartesian_controller on a stage: poses, frames, twists, cancels, lost joints, and what is refused."""
 
-from __future__ import annotations
-
 import math
 import random
 import re

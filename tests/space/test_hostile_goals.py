@@ -1,7 +1,5 @@
 """Three clients send nonsense at 200 Hz; the judge is the goals that servos of the simulated bus receive."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import random

@@ -1,7 +1,5 @@
 """A tip that follows the tip of another arm, which a hand moves; judged by what the follower was sent."""
 
-from __future__ import annotations
-
 import math
 from itertools import pairwise
 from pathlib import Path

@@ -2,8 +2,6 @@
 `refusals.txt`, each with the text of the command, or of the goal.
 """
 
-from __future__ import annotations
-
 import shlex
 from contextlib import nullcontext
 from pathlib import Path

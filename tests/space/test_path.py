@@ -1,7 +1,5 @@
 """Paths: straight, within all limits also through singularities, without jumps; what has none is refused."""
 
-from __future__ import annotations
-
 import math
 import random
 import re

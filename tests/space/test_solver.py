@@ -1,7 +1,5 @@
 """Poses are solved within limits, judged by matrices of our own and by pinocchio; distances are true."""
 
-from __future__ import annotations
-
 import math
 import random
 from functools import cache

@@ -1,7 +1,5 @@
 """Poses of tips in the robot file, in motions and from Python, judged by our own forward kinematics."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

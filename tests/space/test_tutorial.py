@@ -1,7 +1,5 @@
 """docs/tutorial/space.md, typed from top to bottom; its arm runs on virtual time."""
 
-from __future__ import annotations
-
 import re
 import runpy
 import shlex

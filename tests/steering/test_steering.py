@@ -1,7 +1,5 @@
 """What clients request of a robot that runs, and what comes of it: the stories of `*.txt`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Where frames lie: against pinocchio on random poses, mimic joints, and the body that its IMU turns."""
 
-from __future__ import annotations
-
 import math
 import random
 from collections.abc import Iterator

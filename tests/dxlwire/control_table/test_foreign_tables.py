@@ -1,7 +1,5 @@
 """Our control tables against those of others: rustypot, the maker's SDK, and its examples."""
 
-from __future__ import annotations
-
 import importlib.util
 import math
 import re

@@ -1,7 +1,5 @@
 """Names and numbers of models, tables of servos and devices from files, and mistakes in them."""
 
-from __future__ import annotations
-
 import math
 import re
 import tomllib

@@ -1,7 +1,5 @@
 """Controller whose class has all that a plug-in can get wrong; it is checked, and never runs."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Annotated, ClassVar

@@ -1,7 +1,5 @@
 """The cycle record: one memory for the loop's arrays, the ring and the log's message."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

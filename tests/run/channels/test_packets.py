@@ -1,7 +1,5 @@
 """Packet batches: every byte that goes in comes out, whatever the sizes."""
 
-from __future__ import annotations
-
 import os
 import struct
 

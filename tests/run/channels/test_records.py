@@ -1,7 +1,5 @@
 """Commands, events and messages through a ring: whatever was taken comes out whole, or is counted as lost."""
 
-from __future__ import annotations
-
 import msgspec
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Rings: what is delivered is what was appended, and what is not is declared."""
 
-from __future__ import annotations
-
 import os
 import random
 import struct

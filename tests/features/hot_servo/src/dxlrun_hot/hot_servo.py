@@ -1,7 +1,5 @@
 """Policy `on_hot_servo`: acts once when a servo becomes hot, and holds controllers until it is cool."""
 
-from __future__ import annotations
-
 from typing import Literal, Self
 
 import msgspec

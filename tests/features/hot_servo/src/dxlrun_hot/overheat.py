@@ -1,7 +1,5 @@
 """Policy `on_overheat`: steps that end the run when a servo is too hot."""
 
-from __future__ import annotations
-
 from typing import Self
 
 from dxlrun.tooling.features import MonitorStage, PolicyActions, PolicyKey, WrittenPolicy

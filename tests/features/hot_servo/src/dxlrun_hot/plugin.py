@@ -1,7 +1,5 @@
 """Plug-in of the package."""
 
-from __future__ import annotations
-
 from dxlrun import CONTRACT_VERSION, hookimpl
 from dxlrun.tooling.features import Feature
 
