@@ -16,9 +16,8 @@ class SimulationJob(msgspec.Struct, frozen=True):
     core: int = -1  # Core to run on; -1: any
     shafts: int = -1  # Descriptor of the slot for the motion of the shafts; -1: none
     progress: int = -1  # Descriptor of the memory for the progress of the process; -1: none
-    carriers: tuple[int, ...] = ()
-    """Descriptors of sockets that carry the bytes of the buses in place of their terminals; empty: the
-    terminals do."""
+    sockets: tuple[int, ...] = ()
+    """Descriptor of a socket for each bus, whose other end the host holds; empty: a terminal for each."""
 
 
 class SimulationRequest(msgspec.Struct):
@@ -48,7 +47,7 @@ class SimulationMessage(msgspec.Struct, frozen=True, omit_defaults=True):
     """Message from the simulation to its starter: one of these fields, `real_time` with the first ports,
     `lateness_us` with servos."""
 
-    ports: dict[str, str] | None = None  # Device of each bus; empty while an adapter is unplugged
+    ports: dict[str, str] | None = None  # Device of each bus; empty for a socket, or without an adapter
     real_time: str = ""  # Real-time properties that the system granted
     servos: tuple[ServoLook, ...] | None = None
     lateness_us: dict[str, float] = {}

@@ -517,7 +517,7 @@ def test_each_simulated_bus_has_its_own_progress(memory, simulation, stalls):
     ours, theirs = os.pipe()
     buses: Any = [SimpleNamespace(port=SIMULATED)] * 2
     lines: Any = SimpleNamespace(simulation=memory)
-    first, second = make_ports(buses, ("one", "two"), (ours, theirs), lines, stalls)
+    first, second = make_ports(buses, (ours, theirs), lines, stalls)
     publish_served(simulation, ENDLESS_NS)
     publish_received(simulation, SENT + MS // 10)
     assert extended(second, DEADLINE) <= DEADLINE < extended(first, DEADLINE)

@@ -35,7 +35,7 @@ def launch(config: Buses, **options: Any) -> tuple[subprocess.Popen[bytes], sock
     ours, theirs = socket.socketpair()
     command = [sys.executable, "-m", "dxlrun.run.simulation_process", "--job-fd", str(job)]
     command += ["--control-fd", str(theirs.fileno())]
-    inherited = (job, theirs.fileno(), *options.get("carriers", ()))
+    inherited = (job, theirs.fileno(), *options.get("sockets", ()))
     child = subprocess.Popen(command, pass_fds=inherited, stderr=subprocess.PIPE, start_new_session=True)
     theirs.close()
     os.close(job)

@@ -255,11 +255,12 @@ def test_an_unplugged_adapter_hangs_up_and_comes_back_under_another_name(tmp_pat
     assert not link.is_symlink()
 
 
-def test_a_socket_carries_the_bytes_of_a_bus_until_its_adapter_is_unplugged(tmp_path):
+def test_a_bus_is_a_socket_without_a_terminal_until_its_adapter_is_unplugged(tmp_path):
     ours, theirs = socket.socketpair()
     ledger = tmp_path / "bus.jsonl"
-    with ours, theirs, BusProcess(BUSES[:1], ledger, carriers=(theirs.fileno(),)) as process:
+    with ours, theirs, BusProcess(BUSES[:1], ledger, sockets=(theirs.fileno(),)) as process:
         theirs.close()
+        assert process.ports == {"main": ""}
         ours.sendall(PING_1)
         assert receive(ours.fileno(), 6) == PONG_1
         assert "fault" in process.ask(fault="unplug bus=main for=50ms")

@@ -89,21 +89,18 @@ class GuardianPlan:
 
 @dataclass(frozen=True, slots=True)
 class GuardianJob:
-    """Arguments of the guardian's process: its plan, and ports and memory for guardian and loop."""
+    """Arguments of the guardian's process: its plan, and memory for guardian and loop."""
 
     plan: GuardianPlan
-    ports: tuple[str, ...]
-    """Device paths in the order of `plan.buses`; for a simulated bus, its pseudo-terminal."""
     memory: RunMemory
+    sockets: Mapping[str, int]
+    """Descriptor of the socket to each simulated bus, by name of the bus."""
     supervisor: int
     """Process ID of the supervisor."""
     take_over: bool = False
     """True if the loop accepts servos that already have torque."""
     epoch_offset_ns: int = 0
     """Wall time minus the run's clock, ns."""
-    carriers: tuple[int, ...] = ()
-    """Descriptors of the sockets that carry the bytes of simulated buses in place of their terminals, in the
-    order of `plan.buses`; -1 for a real bus."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,7 +146,6 @@ EndText: TypeAlias = EventText[[Sequence[str]]]
 
 def make_ports(
     buses: Sequence[BusPlan],
-    names: Sequence[str],
     descriptors: Sequence[int],
     memory: RunMemory,
     stalls: StallCounter,
@@ -160,20 +156,19 @@ def make_ports(
 
     Args:
         buses: The plan's buses.
-        names: Names of the ports, for messages.
         descriptors: File descriptors of the ports.
         memory: Memory of the run, with the progress of the simulation.
         stalls: Counter of these waits.
     """
     ports: list[SerialPort] = []
     simulated = 0
-    for bus, name, descriptor in zip(buses, names, descriptors, strict=True):
+    for bus, descriptor in zip(buses, descriptors, strict=True):
         if bus.port == SIMULATED:
             line = SimulationProgress(memory.simulation).line(simulated)
-            ports.append(SimulatedPort(descriptor, name, line, stalls))
+            ports.append(SimulatedPort(descriptor, bus.port, line, stalls))
             simulated += 1
         else:
-            ports.append(SerialPort(descriptor, name))
+            ports.append(SerialPort(descriptor, bus.port))
     return ports
 
 
@@ -227,7 +222,7 @@ class SafeStop:
         """Log the loop's unfinished packets; return the robot's lines and a batch for further packets."""
         job, memory = self._job, self._job.memory
         cycle = salvage(mapped(memory.desk), RingReader(memory.packets).head, self._ring)
-        ports = SerialPorts(make_ports(job.plan.buses, job.ports, descriptors, memory, StallCounter()))
+        ports = SerialPorts(make_ports(job.plan.buses, descriptors, memory, StallCounter()))
         packets = PacketBatch(self._ring, cycle=cycle)
         return Lines(
             job.plan.buses, ports, self._clock, packets, self._heartbeat.mark_guardian_alive
@@ -267,10 +262,15 @@ class Guardian:
         """Open the ports, execute and watch the loop, and make the robot safe after the loop has exited."""
         lines = KeptLines(
             [
-                LineSettings(path, bus.baud_rate, bus.latency_ns, bus.rs485, bus.boot_ns, carrier)
-                for path, bus, carrier in zip(
-                    self._job.ports, self._job.plan.buses, self._job.carriers, strict=True
+                LineSettings(
+                    bus.port,
+                    bus.baud_rate,
+                    bus.latency_ns,
+                    bus.rs485,
+                    bus.boot_ns,
+                    self._job.sockets.get(bus.name, -1),
                 )
+                for bus in self._job.plan.buses
             ],
             describe_holder=describe_run,
         )

@@ -253,7 +253,7 @@ def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: Sinks, stalls: S
     stop = StopFlag()
     signal.signal(signal.SIGTERM, lambda *_: stop.request())
     ports = SerialPorts(
-        make_ports(plan.buses, [bus.port for bus in plan.buses], job.ports, job.memory, stalls),
+        make_ports(plan.buses, job.ports, job.memory, stalls),
         LineReopener(MessageChannel(socket.socket(fileno=job.channel), Decoder(LineReturned))),
         _reply_polling(plan.loop.scheduler.reply_polling_ns),
     )

@@ -123,8 +123,10 @@ def loop_grants(memory: RunMemory) -> tuple[Grant, ...]:
 
 def start_simulated_buses(
     plan: Plan, ledger: Path | None, memory: RunMemory
-) -> tuple[Child[SimulationMessage], dict[str, SimulatedLine]]:
-    """Start the simulated servos; return the process and the host's end of each simulated bus.
+) -> tuple[Child[SimulationMessage], dict[str, int]]:
+    """Start the simulated servos; return the process, and a descriptor of the socket to each bus by name.
+
+    A run has no terminal for them: no other program can open its buses.
 
     With a real-time loop, the process gets a priority above loop and guardian, and the last core that is not
     the loop's: a servo's electronics do not wait for the host's processor.
@@ -147,16 +149,13 @@ def start_simulated_buses(
     )
     child = start_simulation(job, memory.stderr)
     try:
-        ports = first_message(child).ports or {}
+        first_message(child)
     except BaseException:
         child.kill()
         raise
     for _, theirs in pairs:
         theirs.close()
-    return child, {
-        bus.name: SimulatedLine(ports[bus.name], ours.detach())
-        for bus, (ours, _) in zip(config.buses, pairs, strict=True)
-    }
+    return child, {bus.name: ours.detach() for bus, (ours, _) in zip(config.buses, pairs, strict=True)}
 
 
 def start_source(
@@ -221,7 +220,7 @@ def start_gateway(
 
 def guardian_job(
     plan: Plan,
-    simulated: Mapping[str, SimulatedLine],
+    sockets: Mapping[str, int],
     memory: RunMemory,
     *,
     take_over: bool,
@@ -239,9 +238,7 @@ def guardian_job(
         lock_memory=scheduler.lock_memory,
         last=plan.loop.policies.on_fault.last,
     )
-    lines = [simulated.get(bus.name, SimulatedLine(bus.port, -1)) for bus in plan.buses]
-    paths, carriers = tuple(one.terminal for one in lines), tuple(one.carrier for one in lines)
-    return GuardianJob(share, paths, memory, os.getpid(), take_over, epoch_offset_ns, carriers)
+    return GuardianJob(share, memory, sockets, os.getpid(), take_over, epoch_offset_ns)
 
 
 def start_guardian(job: GuardianJob, others: Iterable[int]) -> Child[GuardianMessage]:
@@ -251,23 +248,14 @@ def start_guardian(job: GuardianJob, others: Iterable[int]) -> Child[GuardianMes
     dies, these processes see their channels close only after the guardian has made the robot safe.
     """
     memory = job.memory
-    carriers = [one for one in job.carriers if one >= 0]
-    inherited = [memory.guardian, memory.stderr, *memory.of_loop, *carriers, *others]
+    sockets = job.sockets.values()
+    inherited = [memory.guardian, memory.stderr, *memory.of_loop, *sockets, *others]
     program = ProcessModule("guardian", "dxlrun.run.guardian")
     try:
         return _executed(program, job, inherited, memory, Decoder(GuardianMessage))
     finally:
-        for descriptor in carriers:
+        for descriptor in sockets:
             os.close(descriptor)
-
-
-class SimulatedLine(NamedTuple):
-    """Host's end of a simulated bus."""
-
-    terminal: str
-    """Path of its pseudo-terminal."""
-    carrier: int
-    """Descriptor of the socket that carries its bytes in place of the terminal."""
 
 
 class ProcessModule(NamedTuple):

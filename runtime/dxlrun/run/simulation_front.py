@@ -39,7 +39,7 @@ def start_simulation(job: SimulationJob, errors: int) -> Child[SimulationMessage
     """Start the process of simulated buses; its output goes to `errors`."""
     descriptor = child_processes.memory_file("dxlrun-simulation", msgspec.json.encode(job))
     arguments = ["--job-fd", str(descriptor)]
-    inherited = [descriptor, *(one for one in (job.shafts, job.progress, *job.carriers) if one >= 0)]
+    inherited = [descriptor, *(one for one in (job.shafts, job.progress, *job.sockets) if one >= 0)]
     messages = msgspec.json.Decoder(SimulationMessage)
     try:
         return Child("simulated bus", "dxlrun.run.simulation_process", arguments, inherited, errors, messages)

@@ -1,4 +1,5 @@
-"""Simulation process: the simulated buses in real time, with one pseudo-terminal each.
+"""Simulation process: the simulated buses in real time, each on a socket of its host or on a
+pseudo-terminal.
 
 It runs until the other end of the control socket is closed. It first sends the ports, or sends an error and
 exits. Then it answers requests, and reports each fault and each change of the ports: `dxlsim.messages`.
@@ -50,7 +51,7 @@ def main() -> int:
                 shafts=shafts,
                 progress=progress,
                 recordings=recordings,
-                carriers=job.carriers,
+                sockets=job.sockets,
             )
         except (DxlrunError, OSError, LookupError, ValueError) as error:
             starter.send_message(SimulationMessage(error=str(error)))

@@ -59,7 +59,6 @@ from dxlrun.run.run_log import discard_log, incomplete_log, log_header, new_log
 from dxlrun.run.run_processes import (
     GatewayMessage,
     RecorderMessage,
-    SimulatedLine,
     SourceMessage,
     create_memory,
     guardian_job,
@@ -204,9 +203,9 @@ class _Run:
         """Start all processes in sequence, and return the guardian; raises PortError or ProcessFault."""
         if self.options.record:
             self.log = new_log(self.plan.recording, self.plan.robot)
-        simulated: dict[str, SimulatedLine] = {}
+        sockets: dict[str, int] = {}
         if self.plan.simulated:
-            self.simulation, simulated = start_simulated_buses(self.plan, self.options.ledger, self.memory)
+            self.simulation, sockets = start_simulated_buses(self.plan, self.options.ledger, self.memory)
         for planned in planned_processes(self.plan.loop):
             child = start_source(self.plan, planned, self.memory)
             self.sources.append(_SourceProcess(self.plan, planned, self.memory, child))
@@ -222,7 +221,7 @@ class _Run:
         others = [child.channel.fileno() for child in (self.simulation, self.recorder) if child]
         self.job = guardian_job(
             self.plan,
-            simulated,
+            sockets,
             self.memory,
             take_over=self.options.take_over,
             epoch_offset_ns=self.offset_ns,

@@ -25,7 +25,8 @@ _CBAUD, _BOTHER = 0o010017, 0o010000
 
 class PseudoTerminal:
     """Simulation's end (master) of a terminal whose other end (slave) hosts open and close. No slave is open
-    here, because programs check for other users of a port.
+    here, because programs check for other users of a port. A host that started the simulation may hold the
+    other end of a socket in place of the first terminal.
 
     A terminal starts with the rate of the bus. A host that sets another rate sends at that rate, and servos
     at the old rate receive nothing.
@@ -39,7 +40,7 @@ class PseudoTerminal:
         bus: SimulatedBus,
         link: DeviceLink | None = None,
         progress: memoryview | None = None,
-        carrier: int | None = None,
+        socket: int | None = None,
     ) -> None:
         """Create the terminal.
 
@@ -47,23 +48,21 @@ class PseudoTerminal:
             bus: The bus.
             link: Link to the device; None: none.
             progress: Words in which the line's progress is published; None: nobody watches.
-            carrier: Descriptor of a socket that carries the bytes until the adapter is unplugged; None: the
-                terminal does. The Linux kernel moves the bytes of a terminal in a worker thread of ordinary
+            socket: Descriptor of a socket that is used until the adapter is unplugged; None: a terminal is
+                created. The Linux kernel moves the bytes of a terminal in a worker thread of ordinary
                 priority (flush_to_ldisc), which waits for other programs: on busy cores for milliseconds.
         """
         self.bus = bus
         self._link = link
         self._progress = None if progress is None else (ctypes.c_char * progress.nbytes).from_buffer(progress)
-        self._carrier = carrier
-        if carrier is not None:
-            os.set_blocking(carrier, False)
-        self._master, self._name = self._new_pair()
+        self._device, self._name = self._new_pair() if socket is None else (socket, "")
+        os.set_blocking(self._device, False)
         self.state = TerminalState(
             bus=bus.address,
             progress=None if self._progress is None else ctypes.addressof(self._progress),
             served_ns=-1,
-            descriptor=self._master if carrier is None else carrier,
-            has_settings=carrier is None,
+            descriptor=self._device,
+            has_settings=socket is None,
             opened=bus.times_unplugged,
             plugged=1,
         )
@@ -74,7 +73,7 @@ class PseudoTerminal:
 
     @property
     def path(self) -> str:
-        """Path of the device that hosts open; empty while the adapter is unplugged."""
+        """Path of the device that hosts open; empty while the adapter is unplugged, and for a socket."""
         return self._name if self.plugged else ""
 
     @property
@@ -96,12 +95,11 @@ class PseudoTerminal:
         self.state.held_ns = self.state.ready = self.state.size = self.state.known = 0
         if self.state.opened != self.bus.times_unplugged:
             self.state.opened = self.bus.times_unplugged
-            old = self._master
+            old = self._device
             # Opened before the old one is closed, to get another name
-            self._master, self._name = self._new_pair()
+            self._device, self._name = self._new_pair()
             os.close(old)
-            self._close_carrier()
-            self.state.descriptor, self.state.has_settings = self._master, 1
+            self.state.descriptor, self.state.has_settings = self._device, 1
             self._unpublish()
         self.state.plugged = self.bus.plugged
         if self.plugged:
@@ -133,14 +131,8 @@ class PseudoTerminal:
 
     def close(self) -> None:
         """Close the terminal and remove its link."""
-        os.close(self._master)
-        self._close_carrier()
+        os.close(self._device)
         self._unpublish()
-
-    def _close_carrier(self) -> None:
-        if self._carrier is not None:
-            os.close(self._carrier)
-            self._carrier = None
 
     def _new_pair(self) -> tuple[int, str]:
         """Return the descriptor of a new terminal's master and the path of its slave, which is raw and has

@@ -55,7 +55,7 @@ class Server:
         shafts: ShaftSink | None = None,
         progress: ServerProgressReceiver | None = None,
         recordings: Mapping[str, RecordedPackets] = MappingProxyType({}),
-        carriers: Sequence[int] = (),
+        sockets: Sequence[int] = (),
     ) -> None:
         """Create the buses and their terminals.
 
@@ -67,7 +67,7 @@ class Server:
             progress: Receives the time up to which each line was served, for a host that waits for this
                 process.
             recordings: Packets of each bus that is `recorded`, by the name of the bus.
-            carriers: As in `SimulationJob`.
+            sockets: As in `SimulationJob`.
         """
         self.start_ns = time.monotonic_ns()
         self._ledger = ledger
@@ -89,7 +89,7 @@ class Server:
                 bus,
                 links.get(bus.name),
                 None if progress is None else progress.line(index).words,
-                carriers[index] if carriers else None,
+                sockets[index] if sockets else None,
             )
             for index, bus in enumerate(self._buses)
         )

@@ -298,8 +298,7 @@ class SimulatingLineProgress(Protocol):
 
 
 class SimulatedPort(SerialPort):
-    """Port of simulated servos: a pseudo-terminal, or the socket that carries its bytes. Their process may
-    have to wait for a processor core.
+    """Port of simulated servos: a socket to their process, which may have to wait for a processor core.
 
     A reply is awaited beyond its deadline while `progress` shows one of these: the process has not read
     the request, has not served the line up to the deadline, or has sent bytes that are still in the

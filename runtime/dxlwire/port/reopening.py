@@ -50,9 +50,9 @@ class LineSettings(msgspec.Struct, frozen=True):
     latency_ns: int  # Longest acceptable latency timer of its adapter
     rs485: bool = False
     boot_ns: int = 0  # Boot time of the adapter after it was plugged in and opened
-    carrier: int = -1
-    """Descriptor of a socket that carries the bytes of simulated servos after their terminal was opened; -1:
-    none. The opened lines own it."""
+    socket: int = -1
+    """Descriptor of a socket to simulated servos, in place of a device; -1: none. The opened lines own it and
+    do not reopen it."""
 
 
 class OpenedLine(msgspec.Struct, frozen=True):
@@ -108,7 +108,7 @@ class KeptLines:
             self.close()
             raise
         threading.stack_size(_STACK)
-        self._names = [lasting_name(line.path) for line in lines]
+        self._names = ["" if line.socket >= 0 else lasting_name(line.path) for line in lines]
         self._back: queue.SimpleQueue[OpenedLine] = queue.SimpleQueue()
         self._bell = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
 
@@ -146,6 +146,8 @@ class KeptLines:
 
     def _open(self, index: int, path: str) -> OpenedLine:
         line = self._lines[index]
+        if line.socket >= 0:
+            return OpenedLine(index, line.socket, "", "")
         port = open_serial(
             path,
             line.baud_rate,
@@ -155,10 +157,7 @@ class KeptLines:
         )
         done, wrong = shorten(port.fileno(), path, line.latency_ns, self._system)
         remark = rate_remark(port, line.baud_rate)
-        descriptor = port.detach()
-        if line.carrier >= 0:
-            put_in_place(line.carrier, descriptor)
-        return OpenedLine(index, descriptor, done, wrong, remark)
+        return OpenedLine(index, port.detach(), done, wrong, remark)
 
     def _keep_trying(self, index: int) -> None:
         pause_s = FIRST_PAUSE_S
