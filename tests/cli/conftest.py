@@ -3,6 +3,7 @@ from pathlib import Path
 
 import pytest
 from tests.kit.bus_process import SimulatedLine, simulated_lines
+from tests.kit.rigs import VirtualLines
 
 ROBOTS = Path(__file__).parents[2] / "robots"
 
@@ -31,3 +32,8 @@ def simulated_line(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Simulat
     """Serve a simulated bus; gives its pseudo-terminal, and what ends it and has the ledger."""
     with simulated_lines(tmp_path_factory.mktemp("line")) as serve:
         yield serve
+
+
+@pytest.fixture
+def virtual_lines(monkeypatch: pytest.MonkeyPatch) -> VirtualLines:
+    return VirtualLines(monkeypatch)

@@ -5,22 +5,13 @@ imported; then everything that only Linux has is taken away, dxlrun is imported 
 """
 
 import json
-import os
-import select
-import socket
 import subprocess
 import sys
-import threading
-from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
 import pytest
-from tests.kit.bus_process import opened, simulated_lines
 from tests.kit.commands import Dxlrun, Said
-
-from dxlsim.simulation_plan import BusConfig, ServoConfig
 
 pytestmark = pytest.mark.long
 
@@ -46,9 +37,22 @@ POSIX = {
 """What Windows lacks as well; and these modules: """
 MODULES = ("fcntl", "termios", "tty", "pty", "resource", "pwd", "grp", "_posixsubprocess", "syslog", "curses")
 ELSEWHERE = """
-import contextlib, importlib, io, json, sys
+import contextlib, importlib, io, json, serial, sys, time
 from dxlrun.cli import main
+from dxlsim.bus.ledger import Ledger
+from dxlsim.bus.simulated_bus import SimulatedBus
+from dxlsim.simulation_plan import BusConfig, ServoConfig
 
+servo = ServoConfig(1, "MX-64", 3.0, 0)
+bus = SimulatedBus(BusConfig("main", 1_000_000, (servo,)), Ledger(), time.monotonic_ns())
+
+class Port:  # no other process, which the commands would have to wait for
+    baudrate = 1_000_000
+    write = lambda self, data: bus.receive_bytes(data, time.monotonic_ns())
+    read = lambda self, size: bus.drain_bytes(time.monotonic_ns())
+    close = lambda self: None
+
+serial.serial_for_url = lambda *words, **named: Port()
 platform, names, modules, lines = json.loads(sys.argv[1])
 
 def run(words):
@@ -74,6 +78,7 @@ from dxlrun.cli import main
 
 print(json.dumps([run(words) for words in lines]))
 """
+PORT = "/dev/serial"
 SINGLE = str(ROOT / "robots/single_joint.yaml")
 WORK = {
     "check": ("check TORSO", "Policies"),
@@ -87,7 +92,7 @@ WORK = {
     "scan": ("scan PORT --protocol 1 --baud 1000000 --ids 1-2 --log scan.mcap", "MX-64"),
     "servo": ("servo PORT 1 set led 1 --protocol 1 --baud 1000000", "LED (25)"),
     "online": (f"check {SINGLE} port:=PORT --online", "1 servo compared with the file, no differences"),
-    "log of scan": ("analyze scan.mcap", "`dxlrun scan socket://"),
+    "log of scan": ("analyze scan.mcap", "`dxlrun scan /dev/serial"),
 }
 """Commands that work, with words of their output."""
 REFUSED = {
@@ -128,47 +133,18 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return next((place / "logs").iterdir())
 
 
-@pytest.fixture(scope="module")
-def port(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """A servo at a URL of pyserial, which is a serial line on every system."""
-
-    def serve(line: int) -> None:
-        with suppress(OSError):  # until the server is closed
-            while host := server.accept()[0]:
-                with suppress(OSError), host:
-                    join(line, host)
-
-    def join(line: int, host: socket.socket) -> None:
-        while ready := select.select([line, host], [], [])[0]:
-            if line in ready:
-                host.sendall(os.read(line, 4096))
-            elif not (data := host.recv(4096)):
-                return
-            else:
-                os.write(line, data)
-
-    servo = BusConfig("main", 1_000_000, (ServoConfig(1, "MX-64", 3.0, 0),))
-    with (
-        simulated_lines(tmp_path_factory.mktemp("servo")) as simulated_line,
-        opened(simulated_line(servo)[0]) as line,
-        socket.create_server(("127.0.0.1", 0)) as server,
-    ):
-        threading.Thread(target=serve, args=(line,), daemon=True).start()
-        yield f"socket://127.0.0.1:{server.getsockname()[1]}"
-
-
 @pytest.fixture(scope="module", params=["win32", "darwin"])
 def elsewhere(
-    request: pytest.FixtureRequest, log: Path, port: str, tmp_path_factory: pytest.TempPathFactory
+    request: pytest.FixtureRequest, log: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> Elsewhere:
     """Run all commands as if on another system."""
     windows = request.param == "win32"
     place = tmp_path_factory.mktemp(request.param)
     lacking = {one: f"{LINUX.get(one, '')} {POSIX.get(one, '') if windows else ''}" for one in LINUX | POSIX}
     commands = WORK | REFUSED | (WINDOWS if windows else {})
-    given_for = {"TORSO": TORSO, "LOG": str(log), "PORT": port}
+    given_for = {"TORSO": TORSO, "LOG": str(log), "PORT": PORT}
     lines = [
-        [given_for.get(word, word) for word in words.replace("=PORT", f"={port}").split()]
+        [given_for.get(word, word) for word in words.replace("=PORT", f"={PORT}").split()]
         for words, _ in commands.values()
     ]
     given = json.dumps([request.param, lacking, MODULES if windows else (), lines])

@@ -17,6 +17,7 @@ import pytest
 from tests.kit.awaited import DEADLINE_S
 from tests.kit.commands import Dxlrun
 from tests.kit.pages import page_blocks, page_commands, page_text
+from tests.kit.rigs import VirtualLines
 
 import dxlrun as face
 from dxlrun import RemoteRobot
@@ -160,8 +161,9 @@ def test_simulation_md(dxlrun: Dxlrun, reader: Path, served: list[BusConfig]) ->
     assert {kind for row in rows for kind in re.findall(r"`(\w+)`", row)} == set(KINDS)
 
 
-def test_tools_md(dxlrun: Dxlrun, reader: Path, simulated_line: Line) -> None:
-    path, finish = simulated_line(BusConfig("main", 1_000_000, (ServoConfig(1, "XM430-W350", 2.0),), 2.0))
+def test_tools_md(dxlrun: Dxlrun, reader: Path, virtual_lines: VirtualLines) -> None:
+    servo = ServoConfig(1, "XM430-W350", 2.0)
+    path, finish = virtual_lines.serve(BusConfig("main", 1_000_000, (servo,), 2.0))
     scan, synopsis, *servo = page_commands("tools.md")
     assert (synopsis, len(servo)) == (["servo", "PORT", "ID", "VERB"], 3)
     found = typed(dxlrun, [scan[0], path, *scan[2:], "--baud", "1000000", "--ids", "1-9"])
@@ -176,8 +178,9 @@ def test_tools_md(dxlrun: Dxlrun, reader: Path, simulated_line: Line) -> None:
     assert (1, items["id"].address, b"\x07") in writes
 
 
-def test_devices_md(dxlrun: Dxlrun, reader: Path, simulated_line: Line) -> None:
-    path, _ = simulated_line(BusConfig("main", 1_000_000, (), 2.0, devices=(DeviceConfig(200, "OpenCR"),)))
+def test_devices_md(dxlrun: Dxlrun, reader: Path, virtual_lines: VirtualLines) -> None:
+    board = DeviceConfig(200, "OpenCR")
+    path, _ = virtual_lines.serve(BusConfig("main", 1_000_000, (), 2.0, devices=(board,)))
     robot = simulated_robot("robots/wolfgang.yaml")
     lines = page_commands("devices.md")
     assert len(lines) == 10
@@ -256,14 +259,13 @@ def test_programs_of_the_sdk_and_the_bus_move_both_servos(simulated_line: Line) 
 
 
 def test_client_moves_the_arm_that_a_scan_has_drafted(
-    dxlrun: Dxlrun, reader: Path, monkeypatch: pytest.MonkeyPatch, simulated_line: Line
+    dxlrun: Dxlrun, reader: Path, monkeypatch: pytest.MonkeyPatch, virtual_lines: VirtualLines
 ) -> None:
-    port, finish = two_servos(simulated_line)
+    port, _ = two_servos(virtual_lines.serve)
     simulate, scan, check, run, koch = page_commands(LIBRARIES)
     assert (simulate[:3], run) == (["sim", "--servo", "XL330-M288:1-2"], ["arm.yaml"])
     given = [port if word == "/dev/ttyUSB0" else word for word in scan]
     typed(dxlrun, [*given, "--baud", "57600", "--ids", "1-2", "--protocol", "2.0"])
-    finish()
     typed(dxlrun, check)
     arm = reader / "arm.yaml"
     arm.write_text(arm.read_text().replace(port, "sim"))

@@ -1,4 +1,4 @@
-"""`dxlrun scan`: a pseudo-terminal with simulated servos, judged by the ledger."""
+"""`dxlrun scan`: simulated servos, mostly on virtual time, judged by the ledger."""
 
 import subprocess
 import sys
@@ -12,7 +12,7 @@ from tests.kit.answers import result_of
 from tests.kit.bus_ports import BusPorts
 from tests.kit.commands import Dxlrun
 from tests.kit.mixed_line import MixedBus
-from tests.kit.rigs import VirtualLine
+from tests.kit.rigs import VirtualLine, VirtualLines
 
 from dxlrun.cli.tools.scan import scan
 from dxlrun.dynamixel.tools import tool_port
@@ -41,9 +41,9 @@ def heard(finish: Callable[[], Any]) -> list[bytes]:
 
 
 def test_servos_are_a_table_a_log_and_a_robot_file_that_check_accepts(
-    dxlrun: Dxlrun, simulated_line: Line, tmp_path: Path
+    dxlrun: Dxlrun, virtual_lines: VirtualLines, tmp_path: Path
 ) -> None:
-    path, finish = simulated_line(bus("XM430-W350", "XL430-W250"))
+    path, finish = virtual_lines.serve(bus("XM430-W350", "XL430-W250"))
     robot, log = tmp_path / "arm.yaml", tmp_path / "scan.mcap"
     said = dxlrun("scan", path, "--protocol", "2.0", *NARROW, "--output", robot, "--log", log)
     assert (said.code, said.err) == (0, "")
@@ -70,8 +70,10 @@ def test_servos_are_a_table_a_log_and_a_robot_file_that_check_accepts(
     assert f"traffic of `dxlrun scan {path}`, not a run: {len(read.packets)} packets" in said.out
 
 
-def test_both_protocols_are_looked_at_and_reported_as_json(dxlrun: Dxlrun, simulated_line: Line) -> None:
-    path, finish = simulated_line(bus("AX-12A"))
+def test_both_protocols_are_looked_at_and_reported_as_json(
+    dxlrun: Dxlrun, virtual_lines: VirtualLines
+) -> None:
+    path, finish = virtual_lines.serve(bus("AX-12A"))
     said = dxlrun("scan", path, *NARROW, "--json")
     result = result_of(said.out)
     assert (said.code, result["port"]) == (0, path)
@@ -88,7 +90,7 @@ def test_both_protocols_are_found_on_one_line_with_a_warning(
     """A status of the XL430, at -16 ticks, is the beginning of 258 bytes for the AX-12A."""
     line: Any = VirtualLine(rate=1_000_000)
     line.bus = MixedBus([ServoConfig(1, "AX-12A", 2.0), ServoConfig(2, "XL430-W250", 2.0)], line.ledger)
-    line.ports, line.other_rates = BusPorts(line.clock, [line.bus]), {}
+    line.ports = BusPorts(line.clock, [line.bus])
     line.bus.servo(2).show_live({"present_position": lambda: -16})
     monkeypatch.setattr(tool_port, "TunablePort", lambda path: line)
     assert scan("/dev/ttyUSB0", baud=(1_000_000,), ids="1-8", as_json=True) == 0
@@ -98,8 +100,8 @@ def test_both_protocols_are_found_on_one_line_with_a_warning(
     assert "/dev/ttyUSB0 has servos of both protocols: give each protocol an adapter of its own" in said
 
 
-def test_no_servo_at_all_is_exit_code_one(dxlrun: Dxlrun, simulated_line: Line) -> None:
-    path, _ = simulated_line(bus())
+def test_no_servo_at_all_is_exit_code_one(dxlrun: Dxlrun, virtual_lines: VirtualLines) -> None:
+    path, _ = virtual_lines.serve(bus())
     said = dxlrun("scan", path, *NARROW)
     assert (said.code, f"no servo answers at {path}" in said.err) == (1, True)
 

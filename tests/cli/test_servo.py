@@ -1,4 +1,4 @@
-"""`dxlrun servo` on a pseudo-terminal, the cases of servo.txt: judged by the simulated bus' ledger."""
+"""`dxlrun servo` on virtual time, the cases of servo.txt: judged by the simulated bus' ledger."""
 
 import io
 import json
@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 from tests.kit.answers import result_of
-from tests.kit.awaited import until
 from tests.kit.commands import Case, Dxlrun, Said, Stage, cases, play
+from tests.kit.rigs import VirtualLines
 
 from dxlrun.dynamixel.tools import scanning
 from dxlrun.dynamixel.tools.scanning import FoundServo
@@ -27,7 +27,6 @@ pytestmark = pytest.mark.long
 
 NEW = ("--protocol", "2.0", "--baud", "1000000")
 OLD = ("--protocol", "1.0", "--baud", "1000000")
-Line = Callable[[BusConfig], tuple[str, Callable[[], Any]]]
 
 
 def writes(entries: Iterable[LedgerEntry]) -> list[bytes]:
@@ -40,9 +39,9 @@ def writes(entries: Iterable[LedgerEntry]) -> list[bytes]:
 class OnALine(Stage):
     """A simulated bus, whose ledger is read after the last command."""
 
-    def __init__(self, start: Line, dxlrun: Dxlrun) -> None:
+    def __init__(self, lines: VirtualLines, dxlrun: Dxlrun) -> None:
         super().__init__()
-        self._start, self._dxlrun = start, dxlrun
+        self._lines, self._dxlrun = lines, dxlrun
         self.given = {"servos": self._servos, "boards": self._boards, "tripped": self._await_watchdog}
         self.asked = {"written": self._written}
         self.names = {"NEW": [*NEW], "FAST": [*NEW[:-1], "2000000"]}
@@ -58,14 +57,14 @@ class OnALine(Stage):
         self._serve(BusConfig("main", 1_000_000, servos, 2.0, devices=boards))
 
     def _serve(self, bus: BusConfig) -> None:
-        path, self._finish = self._start(bus)
+        path, self._finish = self._lines.serve(bus)
         self.names["PORT"] = [path]
 
     def _await_watchdog(self, servo_id: str) -> None:
         """Wait while no instruction reaches the servo."""
-        port = self.names["PORT"]
-        read = ("servo", *port, servo_id, "get", "bus_watchdog", *NEW)
-        until(lambda: "tripped" in self._dxlrun(*read).out, pause_s=0.2)  # its time is 20 ms
+        self._lines.wait(0.03)  # its time is 20 ms
+        read = ("servo", *self.names["PORT"], servo_id, "get", "bus_watchdog", *NEW)
+        assert "tripped" in self._dxlrun(*read).out
 
     def _written(self) -> list[str]:
         return [f"{one[0]} {one[1:].hex(' ')}" for one in writes(self._finish())] or ["nothing"]
@@ -73,20 +72,20 @@ class OnALine(Stage):
 
 @pytest.mark.usefixtures("reader")
 @pytest.mark.parametrize("case", cases("servo.txt"))
-def test_verbs_of_servo(dxlrun: Dxlrun, simulated_line: Line, case: Case) -> None:
-    play(case, dxlrun, OnALine(simulated_line, dxlrun))
+def test_verbs_of_servo(dxlrun: Dxlrun, virtual_lines: VirtualLines, case: Case) -> None:
+    play(case, dxlrun, OnALine(virtual_lines, dxlrun))
 
 
 Command = Callable[..., Said]
 
 
 @pytest.fixture
-def one(dxlrun: Dxlrun, simulated_line: Line) -> Callable[..., tuple[Command, Callable[[], Any]]]:
+def one(dxlrun: Dxlrun, virtual_lines: VirtualLines) -> Callable[..., tuple[Command, Callable[[], Any]]]:
     """Serve servos of one model; gives the command, and the end with the ledger."""
 
     def start(model: str = "XM430-W350", protocol: float = 2.0, ids: tuple[int, ...] = (1,)) -> Any:
         servos = tuple(ServoConfig(each, model, 2.0) for each in ids)
-        path, finish = simulated_line(BusConfig("main", 1_000_000, servos, protocol))
+        path, finish = virtual_lines.serve(BusConfig("main", 1_000_000, servos, protocol))
         return lambda servo_id, *words: dxlrun("servo", path, servo_id, *words), finish
 
     return start
@@ -189,9 +188,9 @@ def test_packets_of_a_verb_are_a_log_when_it_is_named(one: Any, tmp_path: Path) 
     assert " servo " in read.metadata["tool"]["command"]
 
 
-def test_boards_of_protocol_1_are_found(dxlrun: Dxlrun, simulated_line: Line) -> None:
+def test_boards_of_protocol_1_are_found(dxlrun: Dxlrun, virtual_lines: VirtualLines) -> None:
     servos, devices = (ServoConfig(1, "MX-28", 3.0),), (DeviceConfig(200, "CM-730"),)
-    path, _ = simulated_line(BusConfig("main", 1_000_000, servos, 1.0, devices=devices))
+    path, _ = virtual_lines.serve(BusConfig("main", 1_000_000, servos, 1.0, devices=devices))
     said = dxlrun("scan", path, *OLD, "--ids", "1,200", "--json")
     found = [(each["servo_id"], each["model"]) for each in result_of(said.out)["servos"]]
     assert found == [(1, "MX-28"), (200, "CM-730")]

@@ -2,6 +2,7 @@
 
 import pytest
 from tests.kit.bus_process import simulated_lines
+from tests.kit.rigs import VirtualLines
 
 
 @pytest.fixture
@@ -9,3 +10,8 @@ def simulated_line(tmp_path):
     """Run a simulated bus as a run does; gives its pseudo-terminal, and what ends it and has the ledger."""
     with simulated_lines(tmp_path) as serve:
         yield serve
+
+
+@pytest.fixture
+def virtual_lines(monkeypatch):
+    return VirtualLines(monkeypatch)

@@ -1,4 +1,4 @@
-"""`dxlrun check ROBOT --online` on pseudo-terminals, judged by the simulated bus' ledger."""
+"""`dxlrun check ROBOT --online` on virtual time, judged by the simulated bus' ledger."""
 
 import pytest
 from tests.kit.answers import result_of
@@ -23,12 +23,12 @@ joints:
 
 
 @pytest.fixture
-def check(simulated_line, tmp_path, capsys):
+def check(virtual_lines, tmp_path, capsys):
     """Run the command on two simulated servos; gives exit code, both outputs, and what the bus was sent."""
 
     def check(registers, *words, ids=(1, 2), robot_text=ROBOT, before=()):
         servos = tuple(ServoConfig(servo_id, "XM430-W350", 3.0, 0) for servo_id in ids)
-        path, finish = simulated_line(BusConfig("main", 1_000_000, servos, 2.0))
+        path, finish = virtual_lines.serve(BusConfig("main", 1_000_000, servos, 2.0))
         assert not before or main(["servo", path, *before, "--protocol", "2.0", "--baud", "1000000"]) == 0
         robot = tmp_path / "robot.yaml"
         robot.write_text(robot_text.replace("PORT", path).replace("REGISTERS", registers))

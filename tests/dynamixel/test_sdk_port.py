@@ -5,10 +5,12 @@ import sys
 from types import SimpleNamespace
 
 import pytest
+import serial
 from dynamixel_sdk import COMM_SUCCESS, Protocol2PacketHandler
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
+from tests.kit.awaited import until
 from tests.kit.line_faults import delay_next
 from tests.kit.rigs import VirtualLine
 
@@ -18,6 +20,7 @@ from dxlrun.dynamixel.tools.tool_line import ToolLine
 from dxlrun.dynamixel.tools.tool_port import TunablePort
 from dxlrun.errors import PortError
 from dxlsim.simulation_plan import BusConfig, ServoConfig
+from dxlwire.bus import adjustable_port
 from dxlwire.bus.sdk_port import StuffedPackets
 from dxlwire.control_table import find_table
 from dxlwire.packets import PacketKind
@@ -143,12 +146,27 @@ def test_port_that_pyserial_opens_finds_servos(simulated_line, macos):
     servos = (ServoConfig(3, "XM430-W350", 2.0), ServoConfig(7, "XL430-W250", 1.0))
     path, finish = simulated_line(BusConfig("main", 57_600, servos, 2.0))
     with TunablePort(path) as port:
-        found = scan(ToolLine(port), Search((2.0,), (1_000_000, 57_600), tuple(range(1, 9)))).servos
+        tool, search = ToolLine(port), Search((2.0,), (1_000_000, 57_600), tuple(range(1, 9)))
+        # the process of the servos may get no processor for longer than a scan waits
+        found = until(lambda: len(servos := scan(tool, search).servos) == 2 and servos)
     assert [(one.servo_id, one.model, one.remarks) for one in found] == [
         (3, "XM430-W350", ()),
         (7, "XL430-W250", ()),
     ]
     assert {entry.data[7] for entry in finish() if entry.direction == "in"} == {1, 2}
+
+
+def test_bytes_that_arrive_while_this_process_has_no_processor_are_read(macos, monkeypatch):
+    reads: list[bytes] = []
+
+    def read(_):
+        reads.append(b"late" * len(reads))
+        return reads[-1]
+
+    port = SimpleNamespace(read=read, close=None)
+    monkeypatch.setattr(serial, "serial_for_url", lambda *_, **__: port)
+    monkeypatch.setattr(adjustable_port.time, "monotonic_ns", lambda: 50 * len(reads))
+    assert adjustable_port.PyserialLine("COM3", 57_600).receive_bytes(10) == b"late"
 
 
 def test_pyserial_names_what_is_wrong_with_a_port(simulated_line, macos, monkeypatch):

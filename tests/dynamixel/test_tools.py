@@ -229,9 +229,9 @@ def test_a_line_that_is_gone():
         asked([make_plan((1,), name="arm", joints=("a",))], "a", line)
 
 
-def test_a_robot_file_is_compiled_with_what_the_servo_says(simulated_line, tmp_path):
+def test_a_robot_file_is_compiled_with_what_the_servo_says(virtual_lines, tmp_path):
     config = BusConfig("main", 1_000_000, servos_of("XL-320", "XM430-W350"), 2.0)
-    path, _ = simulated_line(config)
+    path, _ = virtual_lines.serve(config)
     robot = tmp_path / "robot.yaml"
     robot.write_text(ROBOT.replace("PORT", path))
     checked = compile_files(robot, {}, [])

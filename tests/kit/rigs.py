@@ -36,13 +36,15 @@ from dxlrun.channels.logged_packets import LoggedPacket, PacketBatch
 from dxlrun.channels.ring import Handover
 from dxlrun.dynamixel.bus_part import FeatureParts
 from dxlrun.dynamixel.dynamixel_hardware import DynamixelHardware, ServoArrays
+from dxlrun.dynamixel.tools import inspection, tool_port
 from dxlrun.errors import StartUpError
 from dxlrun.features import FEATURES
 from dxlrun.features.devices.plan import decode_devices
-from dxlsim.bus.ledger import Ledger
+from dxlsim.bus.ledger import Ledger, LedgerEntry
 from dxlsim.bus.simulated_bus import SimulatedBus
 from dxlsim.servo.simulated_servo import SimulatedServo
-from dxlsim.simulation_plan import AdapterConfig, BusConfig, ServoConfig
+from dxlsim.simulation_plan import AdapterConfig, BusConfig, DeviceConfig, ServoConfig
+from dxlwire.bus.adjustable_port import FIRST_RATE
 from dxlwire.bus_plan import BusPlan
 from dxlwire.clock import VirtualClock
 from dxlwire.exchange.bus_engine import Lines
@@ -246,11 +248,13 @@ class VirtualLine:
         rate: int = 57_600,
         cannot: Sequence[int] = (),
         adapter: AdapterConfig | None = None,
+        devices: tuple[DeviceConfig, ...] = (),
     ) -> None:
-        self.name, self.cannot = "/dev/ttyVirtual", cannot
+        self.name, self.cannot, self.other_rates = "/dev/ttyVirtual", cannot, dict[int, int]()
         self.latency_ns, self.most_latency_ns = 0, 16_000_000
         self.clock, self.ledger = VirtualClock(1_000_000), Ledger()
-        config = BusConfig("main", rate, servos, protocol, adapter=adapter or AdapterConfig())
+        adapter = adapter or AdapterConfig()
+        config = BusConfig("main", rate, servos, protocol, adapter=adapter, devices=devices)
         self.bus = SimulatedBus(config, self.ledger, 0)
         self.ports = BusPorts(self.clock, [self.bus])
 
@@ -276,6 +280,38 @@ class VirtualLine:
     @property
     def heard(self) -> list[bytes]:
         return [entry.data for entry in self.ledger.entries if entry.direction == "in"]
+
+
+class VirtualLines:
+    """Lines on virtual time, at names that commands of this process open as ports: `lines.serve(bus)`.
+
+    A command gives up on a servo after milliseconds, for which the process of a simulated servo may get no
+    processor.
+    """
+
+    def __init__(self, patch: pytest.MonkeyPatch) -> None:
+        self._lines: dict[str, VirtualLine] = {}
+        for module in (tool_port, inspection):
+            patch.setattr(module, "TunablePort", self._open)
+
+    def serve(self, bus: BusConfig) -> tuple[str, Callable[[], Sequence[LedgerEntry]]]:
+        """Return the name of a new line, and what has its ledger."""
+        name = f"/dev/ttyVirtual{len(self._lines)}"
+        self._lines[name] = line = VirtualLine(
+            *bus.servos, protocol=bus.protocol, rate=bus.baud_rate, devices=bus.devices
+        )
+        return name, lambda: line.ledger.entries
+
+    def wait(self, seconds: float) -> None:
+        """Let time pass on all lines."""
+        for line in self._lines.values():
+            line.clock.wait_until(line.clock.now_ns() + round(seconds * 1e9))
+
+    def _open(self, path: str, baud_rate: int = FIRST_RATE, **_: object) -> VirtualLine:
+        line = self._lines[path]
+        line.name = path
+        line.tune(baud_rate)
+        return line
 
 
 def goals_in(packet: bytes, protocol: float) -> tuple[int, list[int]] | None:

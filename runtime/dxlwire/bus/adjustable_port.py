@@ -99,7 +99,11 @@ class PyserialLine:
     def receive_bytes(self, until_ns: int) -> bytes:
         """Wait for bytes until a time of the monotonic clock, and return those that have arrived."""
         try:
-            while not (data := bytes(self._serial.read(_MOST_BYTES))) and time.monotonic_ns() < until_ns:
+            while True:
+                # Compared first: bytes may arrive while this process has no processor.
+                overdue = time.monotonic_ns() >= until_ns
+                if (data := bytes(self._serial.read(_MOST_BYTES))) or overdue:
+                    break
                 time.sleep(_POLL_S)
         except OSError as error:
             raise self._describe_loss(error) from error
