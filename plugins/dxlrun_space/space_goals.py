@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 from pydantic import BeforeValidator, Field, TypeAdapter, model_validator
 
-from dxlrun import Angle, AngularVelocity, CommandModel, Floats, Length, LinearVelocity
+from dxlrun import NAMED_POSE, Angle, AngularVelocity, CommandModel, Floats, Length, LinearVelocity
 from dxlrun.tooling.robots import Transform, from_rpy, product
 from dxlrun_space.chain import Quaternion, Vector
 
@@ -55,7 +55,7 @@ _Frame = Annotated[str, Field(max_length=200)]
 class PoseCommand(CommandModel):
     """Goal pose of the tip. A coordinate that is not given keeps its value at the start"""
 
-    pose: Mapping[str, float] | None = None
+    pose: Annotated[Mapping[str, float], NAMED_POSE] | None = None
     """Name of a pose of the robot file, in place of the coordinates; all joints turn evenly to it"""
     x: _Metres | None = None
     """Goal position in the frame, m"""

@@ -4,6 +4,7 @@ from dxlrun.channels.cycle import Commands as Commands
 from dxlrun.channels.cycle import Floats as Floats
 from dxlrun.channels.cycle import States as States
 from dxlrun.contract.controller import LIVE as LIVE
+from dxlrun.contract.controller import NAMED_POSE as NAMED_POSE
 from dxlrun.contract.controller import NOT_BY_JOINT as NOT_BY_JOINT
 from dxlrun.contract.controller import CommandModel as CommandModel
 from dxlrun.contract.controller import Context as Context

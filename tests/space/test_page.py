@@ -40,6 +40,7 @@ def test_commands_of_the_page(dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch) -
         tips.append(arm.matrix([measured[joint] for joint in arm.joints])[:3, 3])
     assert tips[0] == pytest.approx([0.2, 0.0, 0.15], abs=1e-3)  # within the ticks of servos
     assert tips[1] - tips[0] == pytest.approx([0.0, 0.0, 0.05], abs=1e-3)
+    assert dxlrun("send", "arm", "plan", "above").code == 0
     assert {state.status for state in robot.goals()} == {"reached"}
 
 

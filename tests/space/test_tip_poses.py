@@ -89,6 +89,11 @@ def test_motion_file_and_keyframes_lead_the_tip_to_poses(tmp_path: Path) -> None
     koch.switch(activate=["moves"], deactivate=["hand"])
     assert koch.send("moves", "play", {"motion": "pick"}).goal.wait().status == "reached"
     assert tip(koch) == pytest.approx(SECTION["koch_space"]["above"][:3], abs=0.3)
+    player = {"type": "keyframe_player", "joints": [*FOLLOWER]}
+    koch.pause()
+    with pytest.raises(DxlrunError, match="the robot has no pose abov; did you mean above"):
+        koch.load("more", player | {"motions": {"go": {"steps": [{"time": "1 s", "pose": "abov"}]}}})
+    koch.load("more", player | {"motions": {"go": {"steps": [{"time": "1 s", "pose": "above"}]}}})
 
 
 def test_move_to_waits_for_the_pose_and_raises_what_refused_it(monkeypatch: pytest.MonkeyPatch) -> None:

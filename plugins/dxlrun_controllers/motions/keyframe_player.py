@@ -14,10 +14,11 @@ from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BeforeValidator, Field, StrictInt, StrictStr
+from pydantic import Field, StrictInt, StrictStr
 
 from dxlrun import (
     LIVE,
+    NAMED_POSE,
     Angle,
     AngularVelocity,
     CommandModel,
@@ -64,21 +65,12 @@ PEAK = 1.5
 """Ratio of the peak speed to the mean speed of a cubic from rest to rest."""
 
 
-def refuse_pose(pose: object) -> object:
-    """Refuse the name of a pose: those in the robot file have been replaced by their joints."""
-    if isinstance(pose, str):
-        raise ValueError(f"the robot file has no pose {pose}; correct the name, or add it to `poses`")
-    return pose
-
-
 class Step(ParametersModel):
     """Pose with the motion that leads to it and the pause after it"""
 
     time: Annotated[Duration, Field(ge=10_000_000)]
     """Time of the way to the pose."""
-    pose: Annotated[
-        dict[str, Angle], BeforeValidator(refuse_pose, json_schema_input_type=dict[str, Angle] | str)
-    ]
+    pose: Annotated[dict[str, Angle], NAMED_POSE]
     """Positions by joint, rad, or the name of a pose of the robot file. A joint that is not named keeps its
     last goal."""
     pause: Duration = 0

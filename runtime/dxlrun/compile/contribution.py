@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, ClassVar, TypeAlias
+from collections.abc import Callable, Iterable, Mapping
+from typing import TYPE_CHECKING, ClassVar
 
 import msgspec
-
-from dxlrun.errors import suggestion
 
 # Only names of types: a monitor in the same module brings this one into the loop's process.
 if TYPE_CHECKING:
@@ -15,32 +13,12 @@ if TYPE_CHECKING:
     from dxlrun.compile.joints.compiled_urdf import CompiledUrdf
     from dxlrun.compile.problems import RobotFile
     from dxlrun.control.controllers.plugin_loading import PlugIns
-    from dxlrun.description.units import Measure
     from dxlrun.plan.loop_plan import ControllerPlan, SourcePlan
     from dxlrun.plan.mechanics_plan import MechanicsPlan
     from dxlrun.plan.recording_plan import RecordingPlan
     from dxlsim.simulation_plan import DeviceReadings
     from dxlwire.bus_plan import DevicePlan
     from dxlwire.control_table.device_table import DeviceTable
-
-
-Poses: TypeAlias = "Mapping[str, Mapping[str, Measure]]"
-"""Positions of joints by the name of the pose; empty: the pose needs a joint that the run omits."""
-
-
-def unknown_pose(
-    name: str, poses: Mapping[str, Mapping[str, float]], omitted: Sequence[str]
-) -> tuple[str, str]:
-    """Return problem and fix for the name of a pose that is not in `poses`, or empty there.
-
-    `omitted` are the joints and groups that the run omits.
-    """
-    if name in poses:
-        joints = ", ".join(omitted)
-        return f"pose {name} needs a joint that is omitted ({joints})", f"run with {joints}"
-    known = [each for each, positions in poses.items() if positions]
-    fix = suggestion(name, known) if known else "add it to `poses` of the robot file"
-    return f"the robot has no pose {name}", fix
 
 
 class Compilation(msgspec.Struct, frozen=True):

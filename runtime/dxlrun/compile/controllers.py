@@ -10,7 +10,7 @@ from msgspec.structs import replace
 from pydantic import ValidationError
 
 from dxlrun.channels.cycle import MOST_CONTROLLERS
-from dxlrun.compile.contribution import Contribution, Poses, unknown_pose
+from dxlrun.compile.contribution import Contribution
 from dxlrun.compile.controller_entry import (
     CompiledController,
     WrongEntry,
@@ -24,6 +24,7 @@ from dxlrun.compile.joints.compiled_joints import CompiledJoint
 from dxlrun.compile.joints.compiled_servos import SettingsStage
 from dxlrun.compile.joints.described_servos import used_features
 from dxlrun.compile.joints.limits import report_speed
+from dxlrun.compile.joints.poses import Poses
 from dxlrun.compile.joints.register_values import UnfitRegister
 from dxlrun.compile.problems import RobotFile, into_mark, joint_mark
 from dxlrun.contract.controller import NOT_BY_JOINT, SpeedPeak
@@ -86,14 +87,9 @@ def compile_controllers(
     """
     compiled: dict[str, CompiledController] = {}
     plans: list[ControllerPlan] = []
-    for name, written in file.robot.controllers.items():
-        lacking: list[tuple[KeyPath, str]] = []
-        parameters = _with_poses(written.parameters, poses, ("controllers", name), lacking)
-        entry = written.model_copy(update={"parameters": parameters})
+    for name, entry in file.robot.controllers.items():
         plan = plan_entry(name, entry, _every(file, name, entry.rate))
-        for path, pose in lacking:
-            file.error(file.at(*path), *unknown_pose(pose, poses, file.description.omitted))
-        one = None if lacking else _compiled(file, plan, plugins, entry)
+        one = _compiled(file, plan, plugins, entry, poses)
         if one is not None:
             compiled[name] = one
         plans.append(plan if one is None else one.plan)
@@ -112,32 +108,21 @@ def compile_controllers(
     return compiled
 
 
-def _with_poses(value: object, poses: Poses, path: KeyPath, lacking: list[tuple[KeyPath, str]]) -> object:
-    """Return parameters with the positions of a pose in place of its name at each key `pose`.
-
-    Names of poses that need an omitted joint are added to `lacking`, with their paths.
-    """
-    if isinstance(value, list):
-        return [_with_poses(item, poses, (*path, index), lacking) for index, item in enumerate(value)]
-    if not isinstance(value, dict):
-        return value
-    found = {key: _with_poses(item, poses, (*path, key), lacking) for key, item in value.items()}
-    if isinstance(name := found.get("pose"), str) and name in poses:
-        if not poses[name]:
-            lacking.append(((*path, "pose"), name))
-        found["pose"] = {joint: f"{float(at)!r} {at.unit}" for joint, at in poses[name].items()}
-    return found
-
-
 def _compiled(
-    file: RobotFile, plan: ControllerPlan, plugins: PlugIns, entry: ControllerEntry
+    file: RobotFile, plan: ControllerPlan, plugins: PlugIns, entry: ControllerEntry, poses: Poses
 ) -> CompiledController | None:
     """Compile one controller; None if it has mistakes, which are added to the file."""
     name, robot = plan.name, file.robot
     offer = _offer(file, name, plan.type, plugins)
     if offer is None:
         return None
-    _refuse_uneven(file, name, offer.controller.Parameters)
+    model = offer.controller.Parameters
+    _refuse_uneven(file, name, model)
+    parameters, wrong = poses.put_in(entry.parameters, model)
+    for path, *problem in wrong:
+        file.error(file.at("controllers", name, *path), *problem)
+    entry = entry.model_copy(update={"parameters": parameters})
+    plan = plan_entry(name, entry, plan.every)
     wrapping = {joint for joint, described in robot.joints.items() if described.wrap}
 
     def make_compiled() -> CompiledController:
@@ -145,7 +130,7 @@ def _compiled(
         joints = tuple(robot.joints)
         return compile_entry(plan, offer, joints, wrapping=wrapping, groups=groups, omitted=omitted)
 
-    found = report_entry(file, "controller", name, entry, offer.controller.Parameters, make_compiled)
+    found = report_entry(file, "controller", name, entry, model, make_compiled)
     buses = {f"/bus/{bus}" for bus in robot.buses}
     if found is not None and (taken := buses.intersection(found.plan.topics)):
         mark = file.key("controllers", name)

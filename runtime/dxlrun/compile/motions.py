@@ -24,10 +24,10 @@ import numpy as np
 from msgspec import structs
 from pydantic import ValidationError
 
-from dxlrun.compile.contribution import unknown_pose
 from dxlrun.compile.controller_entry import CompiledController
 from dxlrun.compile.joints.compiled_joints import CompiledJoint
 from dxlrun.compile.joints.limits import check_samples
+from dxlrun.compile.joints.poses import Poses, WrongPose
 from dxlrun.compile.motion_names import PLAY, FoundMotion, find_motion
 from dxlrun.compile.motion_samples import (
     QUANTITIES,
@@ -80,7 +80,7 @@ def compile_motions(
     controllers: Mapping[str, CompiledController],
     joints: Mapping[str, CompiledJoint],
     file: RobotFile,
-    poses: Mapping[str, Mapping[str, float]] = {},
+    poses: Poses,
 ) -> tuple[list[MotionDescription], list[MotionPart]]:
     """Return the motion files of all motions, and their parts; those with mistakes are omitted.
 
@@ -94,8 +94,7 @@ def compile_motions(
         if isinstance(found, MotionDescription):
             played.append(found)
             try:
-                plans = {name: joint.plan for name, joint in joints.items()}
-                found = with_poses(found, poses, plans, file.description.omitted)
+                found = with_poses(found, poses)
             except InputError as error:
                 file.extend(error.problems)
                 continue
@@ -105,28 +104,22 @@ def compile_motions(
     return played, parts
 
 
-def with_poses(
-    motion: MotionDescription,
-    poses: Mapping[str, Mapping[str, float]],
-    joints: Mapping[str, JointPlan],
-    omitted: Sequence[str],
-) -> MotionDescription:
-    """Return a motion whose points have the joints of the poses that they name; raise InputError.
-
-    `omitted` are the joints and groups that the run omits.
-    """
+def with_poses(motion: MotionDescription, poses: Poses) -> MotionDescription:
+    """Return a motion whose points have the joints of the poses that they name; raise InputError."""
     problems = Problems()
 
     def posed(point: Point, number: int, index: int) -> Point:
         if point.pose is None:
             return point
-        if not poses.get(point.pose):
+        try:
+            positions = poses.find_positions(point.pose)
+        except WrongPose as wrong:
             mark = motion.marks.value("motions", index, "points", number, "pose")
-            problems.error(mark, *unknown_pose(point.pose, poses, omitted))
+            problems.error(mark, *what_and_fix(wrong))
+            return point
         targets = {
-            joint: Target(position=Measure(position, joints[joint].unit.si))
-            for joint, position in poses.get(point.pose, {}).items()
-            if joint in joints
+            joint: Target(position=Measure(position, poses.joints[joint].unit.si))
+            for joint, position in positions.items()
         }
         return point.model_copy(update={"joints": targets | point.joints})
 

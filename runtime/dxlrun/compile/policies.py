@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 
-from dxlrun.compile.contribution import Contribution, Poses, unknown_pose
+from dxlrun.compile.contribution import Contribution
 from dxlrun.compile.joints.compiled_joints import CompiledJoint
 from dxlrun.compile.joints.limits import Interval, degrees, limits_of
+from dxlrun.compile.joints.poses import Poses, WrongPose
 from dxlrun.compile.problems import RobotFile
 from dxlrun.description.document import KeyPath
 from dxlrun.description.robot import PoseStep, TorqueStep, WrittenPolicy
-from dxlrun.description.units import Measure
-from dxlrun.errors import suggestion
+from dxlrun.errors import suggestion, what_and_fix
 from dxlrun.features.feature import PolicyKey
 from dxlrun.plan.policy_plan import (
     HOLD,
@@ -38,18 +38,14 @@ def compile_poses(
 ) -> Poses:
     """Return all poses: those of the section `poses`, checked, and those of features, by section."""
     _check_poses(file, joints)
-    poses: dict[str, Mapping[str, Measure]] = {name: {} for name in file.description.omitted_poses}
+    poses: dict[str, Mapping[str, float]] = {name: {} for name in file.description.omitted_poses}
     poses |= file.robot.poses
     for section, contribution in contributions.items():
         for name, positions in contribution.poses.items():
             if name in poses:
                 file.error(file.key(section, name), f"{name} is already the name of a pose", "rename one")
-            poses[name] = {
-                joint: Measure(at, joints[joint].plan.unit.si)
-                for joint, at in positions.items()
-                if joint in joints
-            }
-    return poses
+            poses[name] = positions
+    return Poses(poses, {name: joint.plan for name, joint in joints.items()}, file.description.omitted)
 
 
 def compile_policies(
@@ -116,9 +112,10 @@ def _policy(
                 file.error(mark, f"{name} has steps after {step}", f"write {step} as the last step")
         elif isinstance(step, PoseStep):
             mark_path = ("policies", name, index, "pose")
-            angles = poses.get(step.pose)
-            if not angles:
-                file.error(file.at(*mark_path), *unknown_pose(step.pose, poses, file.description.omitted))
+            try:
+                angles = poses.find_positions(step.pose)
+            except WrongPose as wrong:
+                file.error(file.at(*mark_path), *what_and_fix(wrong))
             else:
                 linear = [joint for joint in angles if joint in joints and joints[joint].plan.unit is LINEAR]
                 if linear and step.linear_speed is None:

@@ -254,7 +254,7 @@ def compile_robot(
         frames=frames,
         simulation=simulation,
         groups=description.groups,
-        poses={name: {joint: float(at) for joint, at in pose.items()} for name, pose in poses.items()},
+        poses={name: {joint: float(at) for joint, at in pose.items()} for name, pose in poses.named.items()},
         omitted=description.omitted,
         gateway=robot.processes.gateway.enabled,
         packages=plugins.packages_of(loop.controllers, _models(buses))

@@ -454,7 +454,7 @@ class GatewayApp:
         try:
             plan = self._link.plan
             motion = parse_motion(given.text, Path(file), plan.groups, plan.omitted)
-            motion = with_poses(motion, plan.poses, self._preparation.joints, plan.omitted)
+            motion = with_poses(motion, self._preparation.poses)
             # Read after parsing, which may have taken long: the motion begins where the joints are now.
             record = self._newest()
             controllers = {

@@ -10,7 +10,6 @@ import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from typing import get_args
 
 import msgspec
 import numpy as np
@@ -18,7 +17,6 @@ from msgspec.structs import replace
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from dxlrun.channels.answers import Code, Field, Refusal
-from dxlrun.compile.contribution import unknown_pose
 from dxlrun.compile.controller_entry import (
     CompiledController,
     WrongEntry,
@@ -29,6 +27,7 @@ from dxlrun.compile.controller_entry import (
 )
 from dxlrun.compile.controller_graph import ControllerGraph, Mistake
 from dxlrun.compile.joints.limits import LimitViolation, beyond_limits
+from dxlrun.compile.joints.poses import Poses, pose_places
 from dxlrun.compile.motions import TRAJECTORY
 from dxlrun.control.controllers.plugin_loading import (
     ControllerClass,
@@ -206,8 +205,7 @@ class Preparation:
     """Names of groups of joints in the robot file, with their joints."""
     omitted: tuple[str, ...] = ()
     """Joints of the robot file that the run omits."""
-    poses: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    """Poses of the robot, as `Plan.poses`."""
+    poses: Poses = field(default_factory=Poses)
     _known: dict[str, ResolvedController] = field(default_factory=dict, init=False)
     """Cache of `known`, by controller name; not used when a controller of that name has another plan now."""
     _schemas: dict[str, dict[str, object]] = field(default_factory=dict, init=False)
@@ -218,7 +216,8 @@ class Preparation:
         """Return the preparation of a robot's commands by its plan and the installed plug-ins."""
         loop, plugins = plan.loop, load_plugins(files=plan.included)
         joints = {joint.name: joint for joint in loop.joints}
-        return cls(joints, plugins, loop.sources, plan.urdf, plan.groups, plan.omitted, plan.poses)
+        poses = Poses(plan.poses, joints, plan.omitted)
+        return cls(joints, plugins, loop.sources, plan.urdf, plan.groups, plan.omitted, poses)
 
     def take_servo_limits(self, joint: str, limits: tuple[ServoLimit, ...]) -> None:
         """Store the registers that limit a joint's servo, so that commands are checked against them."""
@@ -305,9 +304,9 @@ class Preparation:
         what = f"{kind} of {plan.name}"
         if units and _of_motions(kind, model):
             body = in_si(body, what, known.joints)
-        pose = model.model_fields.get("pose")
-        if pose is not None and str not in (pose.annotation, *get_args(pose.annotation)):
-            body = self._with_pose(body, what)
+        if pose_places(model):
+            with suppress(msgspec.MsgspecError, RecursionError):  # refused with the other mistakes
+                body = msgspec.json.encode(self._posed(msgspec.json.decode(body), what, model))
         with plugin_code(plan.name, what, model):
             command = model.model_validate_json(body, strict=True)
             prepared = controller.prepare(kind, command, known.parameters)
@@ -318,15 +317,14 @@ class Preparation:
             beyond = tuple(beyond_limits(known.joints, command, peaks))
         return PreparedCommand(plan.name, kind, data, beyond, body)
 
-    def _with_pose(self, body: bytes, what: str) -> bytes:
-        """Return a command with the positions of a pose in place of its name at the key `pose`."""
-        with suppress(msgspec.MsgspecError, RecursionError):  # refused with the other mistakes
-            written = msgspec.json.decode(body)
-            if isinstance(written, dict) and isinstance(name := written.get("pose"), str):
-                if not (positions := self.poses.get(name)):
-                    raise invalid("{}: {}; {}".format(what, *unknown_pose(name, self.poses, self.omitted)))
-                return msgspec.json.encode({**written, "pose": positions})
-        return body
+    def _posed(self, written: object, what: str, model: type[BaseModel]) -> object:
+        """Return data of a model with positions in place of names of poses; raise RefusedRequest."""
+        posed, wrong = self.poses.put_in(written, model)
+        if wrong:
+            raise invalid(
+                "; ".join(f"{what}: {problem}; {fix}" for _, problem, fix in wrong[:_MOST_MISTAKES])
+            )
+        return posed
 
     def parse_controller(self, plan: ControllerPlan) -> ResolvedController:
         """Return a controller's class, parsed parameters and joints, from the cache if the plan is the same.
@@ -366,6 +364,9 @@ class Preparation:
             raise refused(Code.NAME_TAKEN, {"controller": name, "hint": texts.OTHER_NAME})
         if entry.get("active"):
             raise invalid(texts.active_at_once(name))
+        if (offer := self.plugins.controllers.get(written.type)) is not None:
+            parameters = self._posed(written.parameters, name, offer.controller.Parameters)
+            written = written.model_copy(update={"parameters": parameters})
         # The divider is 1 here; the loop computes it for its own rate.
         plan = self._compiled(replace(plan_entry(name, written, every=1), active=False))
         # Ignore mistakes that exist without the new controller, such as an unloaded lower controller.

@@ -41,7 +41,8 @@ def send(
 
     A pose names joints or groups. All other joints keep their goals. Other commands of a controller have
     keys: `dxlrun send base velocity 'linear=0.1 m/s'`. `dxlrun list` shows the commands of each controller.
-    `dxlrun send arm pose above` names a pose. A device has no command names: `dxlrun send board led=1`.
+    A first key that is a name is omitted: `dxlrun send arm pose above`, `dxlrun send player play wave`.
+    A device has no command names: `dxlrun send board led=1`.
 
     Parameters
     ----------
@@ -68,14 +69,14 @@ def send(
     for_device = "=" in kind
     if for_device:
         words, kind = (kind, *words), SOURCE_COMMANDS
-    elif kind == "pose" and words and "=" not in words[0]:
-        words = (f"pose={words[0]}", *words[1:])
-    written = WrittenEntry.from_words(words, file)
     try:
         seconds = None if in_ is None else duration(in_, bare="s") * 1e-9
     except ValueError as error:
         raise InputError(f"--in: {error}") from None
     with connect_robot(chosen.robot, "send") as robot:
+        if words and "=" not in words[0]:
+            words = (f"{_name_key(robot, controller, kind)}{words[0]}", *words[1:])
+        written = WrittenEntry.from_words(words, file)
         try:
             with begun_or_cancelled(robot, "send", waited=wait):
                 done = robot.send(controller, kind, written.data, units=True, seconds=seconds, goal=wait)
@@ -96,6 +97,17 @@ def send(
                 f"{controller} accepted {kind}, but this command has no end to wait for; omit --wait"
             )
         return show_goal_progress(robot, chosen, done, [done.goal.number])
+
+
+def _name_key(robot: RemoteRobot, controller: str, kind: str) -> str:
+    """Return `key=` with the first key of a command; empty if that key does not accept a name."""
+    listed = robot.info().get("controllers")
+    found = [one["takes"] for one in listed if one["name"] == controller] if isinstance(listed, list) else []
+    fields = found[0].get(kind, {}).get("properties", {}) if found else {}
+    for key, field in [*fields.items()][:1]:
+        if any(each.get("type") == "string" for each in field.get("anyOf", [field])):
+            return f"{key}="
+    return ""
 
 
 def cancel(goal: str = "", /, *, wait: WaitFlag = False, chosen: RobotChoice = ONLY_ONE) -> int:
