@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import NamedTuple, TypeVar
 
 import pytest
+import pytest_timeout
 from hypothesis import settings
 from tests.kit import campaigns, selection, skips
 
@@ -149,6 +150,14 @@ def pytest_configure(config: pytest.Config) -> None:
     # a shell ignores Ctrl-C for what it starts in the background, and what that starts inherits it
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.hookimpl(optionalhook=True, tryfirst=True)
+def pytest_timeout_set_timer(item: pytest.Item, settings: pytest_timeout.Settings) -> object:
+    """Give a test longer on a busy machine: its limit is there to end a hang."""
+    busy = max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
+    longer = settings._replace(timeout=settings.timeout * busy)
+    return pytest_timeout.pytest_timeout_set_timer(item, longer)
 
 
 def pytest_collection_finish() -> None:

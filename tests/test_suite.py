@@ -13,6 +13,7 @@ from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
+import pytest_timeout
 from hypothesis import settings
 from tests.kit.loaded import loaded
 from tests.kit.nested import run_pytest
@@ -30,6 +31,19 @@ def run(*words: str) -> subprocess.CompletedProcess[str]:
 
 def test_every_test_has_a_limit(pytestconfig: pytest.Config) -> None:
     assert 0 < float(pytestconfig.getini("timeout")) <= 120
+
+
+def test_limit_grows_with_the_load(pytestconfig: pytest.Config, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A page is drawn without a graphics processor for 110 s beside 23 programs on two cores."""
+    given: list[float] = []
+    monkeypatch.setattr(
+        pytest_timeout, "pytest_timeout_set_timer", lambda _, settings: not given.append(settings.timeout)
+    )
+    settings = pytest_timeout.Settings(*[None] * len(pytest_timeout.Settings._fields))._replace(timeout=120.0)
+    for load in (0.1, 12.0):
+        monkeypatch.setattr(os, "getloadavg", lambda load=load: (load * (os.cpu_count() or 1), 0.0, 0.0))
+        pytestconfig.hook.pytest_timeout_set_timer(item=None, settings=settings)
+    assert given == [120.0, 1440.0]
 
 
 CLOCKS = {"monotonic", "monotonic_ns", "perf_counter", "time", "time_ns"}

@@ -7,9 +7,9 @@ import time
 from collections.abc import Callable
 from typing import TypeVar
 
-DEADLINE_S = 300.0
-"""Longer than a test may take, whose limit shows where it hangs: beside 24 programs on two processors a run
-takes 70 s to start."""
+DEADLINE_S = 3600.0
+"""Longer than a test may take, whose limit shows where it hangs and grows with the load: beside
+24 programs on two processors a run takes 70 s to start."""
 Found = TypeVar("Found")
 
 

@@ -11,7 +11,8 @@ from xml.etree import ElementTree as ET
 
 import pytest
 from msgspec.structs import replace
-from tests.kit.answers import result_of
+from tests.kit.answers import read_answer, result_of
+from tests.kit.awaited import until
 from tests.kit.experiments import ROBOTS
 from tests.kit.pages import page_commands
 
@@ -38,14 +39,23 @@ def _here(tmp_path, monkeypatch):
 
 
 def test_two_setups_are_run_measured_and_shown(dxlrun, motion_file):
-    """In real time, with all processes; judged by what is there, not by how punctual this machine is."""
+    """In real time, with all processes; judged by what is there, not by how punctual this machine is.
+
+    The guardian kills a loop without priority that gets no processor on a busy machine; it is run again.
+    """
     motion = motion_file("300 ms", 30)
-    said = dxlrun(
-        "experiment", "tracking", ROBOTS / "single_joint.yaml", "position_trajectory:=false",
-        "posvel_trajectory:=true", "--play", motion,
-        "--setups", NORMAL, "--no-stress", "--json",
-    )  # fmt: skip
-    assert said.code == 0
+
+    def run():
+        said = dxlrun(
+            "experiment", "tracking", ROBOTS / "single_joint.yaml", "position_trajectory:=false",
+            "posvel_trajectory:=true", "--play", motion,
+            "--setups", NORMAL, "--no-stress", "--json",
+        )  # fmt: skip
+        errors = read_answer(said.out).errors
+        return None if any("ms of processor time" in error.what for error in errors) else said
+
+    said = until(run)
+    assert said.code == 0, said.out
     assert "1 of 2: sequential sender, normal scheduler" in said.err
     shown = result_of(said.out)
     assert (shown["joint"], shown["motion_ns"], shown["load"]) == ("joint", 300_000_000, "")
