@@ -24,7 +24,7 @@ import pytest
 from tests.kit.awaited import DEADLINE_S, until
 from tests.kit.loaded import loaded
 
-pytestmark = pytest.mark.needs("release")
+pytestmark = [pytest.mark.needs("release"), pytest.mark.timeout(600)]
 
 ROOT = Path(__file__).parents[1]
 OBJECTS = {
@@ -82,7 +82,6 @@ def built(release: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> list
     return files
 
 
-@pytest.mark.timeout(600)
 def test_each_platform_has_a_wheel_with_its_tag_and_the_version(
     release: ModuleType, built: list[Path]
 ) -> None:
@@ -98,7 +97,6 @@ def test_each_platform_has_a_wheel_with_its_tag_and_the_version(
         assert (about["Name"], about["Version"]) == ("dxlrun", VERSION)
 
 
-@pytest.mark.timeout(600)
 def test_a_wheel_has_the_package_with_objects_for_its_processor(built: list[Path]) -> None:
     elffile = importlib.import_module("elftools.elf.elffile")
     sources = {
@@ -118,7 +116,6 @@ def test_a_wheel_has_the_package_with_objects_for_its_processor(built: list[Path
                     assert functions - symbols == set()
 
 
-@pytest.mark.timeout(600)
 def test_no_object_needs_a_newer_system_than_its_tag_names(built: list[Path]) -> None:
     elffile = importlib.import_module("elftools.elf.elffile")
     for path in built[1:-1]:
@@ -145,7 +142,6 @@ def test_no_object_needs_a_newer_system_than_its_tag_names(built: list[Path]) ->
                     assert (needed, versions) == (set(), [])
 
 
-@pytest.mark.timeout(600)
 def test_the_same_tree_gives_the_same_bytes(release: ModuleType, built: list[Path], tmp_path: Path) -> None:
     """In another folder, with other permissions, and with a cache of zig's own that is empty."""
     root = tree(tmp_path / "another" / "folder", umask=0o077)
@@ -155,12 +151,10 @@ def test_the_same_tree_gives_the_same_bytes(release: ModuleType, built: list[Pat
     assert [path.name for path in again if path.read_bytes() != first[path.name]] == []
 
 
-@pytest.mark.timeout(600)
 def test_an_index_takes_all_of_it(release: ModuleType, built: list[Path]) -> None:
     release.judge(built)
 
 
-@pytest.mark.timeout(600)
 def test_a_wheel_that_promises_too_much_is_refused(
     release: ModuleType, built: list[Path], tmp_path: Path
 ) -> None:
@@ -188,7 +182,6 @@ def test_the_sdist_can_be_built_without_a_clone(built: list[Path]) -> None:
     assert not any(name.endswith(".so") for name in names)
 
 
-@pytest.mark.timeout(600)
 def test_demo_runs_from_the_wheels_in_an_empty_environment(
     built: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

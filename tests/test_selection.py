@@ -48,6 +48,13 @@ def test_all_and_named_paths_run_as_a_whole(tmp_path: Path, words: tuple[str, ..
     assert run(tmp_path, "-n", "0", *words).last.startswith("2 passed")
 
 
+def test_long_tests_are_first(tmp_path: Path) -> None:
+    limited = SHORT.replace("def", "@__import__('pytest').mark.timeout(9)\ndef")
+    files = {"test_a.py": SHORT, "test_b.py": LONG, "test_c.py": SHORT + limited.replace("short", "limited")}
+    said = run(tmp_path, "-n", "0", "--all", "--collect-only", files=files).out.splitlines()
+    assert [line.partition("::")[0] for line in said[:4]] == ["test_b.py", *["test_c.py"] * 2, "test_a.py"]
+
+
 @pytest.mark.parametrize(
     ("words", "reason", "code"),
     [

@@ -13,6 +13,8 @@ import pytest
 from tests.kit.browser import CHROMIUM, Browser
 from tests.kit.loaded import loaded
 
+pytestmark = pytest.mark.timeout(600)
+
 ROOT = Path(__file__).parents[1]
 
 
@@ -97,7 +99,6 @@ BAD = """Promise.all([...document.images].map(image => {
 """In a page: the pictures that cannot be shown."""
 
 
-@pytest.mark.timeout(600)
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed; apt install chromium")
 def test_each_page_is_whole_in_chromium(built: Path, sources: Path, address: str, tmp_path: Path) -> None:
     """At two widths: it does not scroll sideways, its pictures load, and it has its code blocks."""
@@ -135,7 +136,6 @@ ROOM = "[...document.querySelectorAll('*')].find(one => one.shadowRoot)?.shadowR
 """In a page: what the search draws in."""
 
 
-@pytest.mark.timeout(600)
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed; apt install chromium")
 def test_search_works_without_a_server(built: Path, address: str, tmp_path: Path) -> None:
     browser = Browser(tmp_path)

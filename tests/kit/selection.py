@@ -1,4 +1,4 @@
-"""Selection: the long tests that a run takes.
+"""Selection: the long tests that a run takes, which are first.
 
 A file with `pytestmark = pytest.mark.long` has runs through all processes, experiments, or commands of pages.
 Whatever is named on the command line runs as a whole. Of the whole suite everything short runs, and the long
@@ -160,17 +160,21 @@ class Selection:
 
     @pytest.hookimpl(tryfirst=True)
     def pytest_collection_modifyitems(self, config: pytest.Config, items: list[pytest.Item]) -> None:
-        """Leave out the long tests that no change can break."""
-        if self._everything:
-            return
+        """Leave out the long tests that no change can break, and put first the files of long ones.
+
+        Short ones at the end keep all cores busy.
+        """
         left_out = {
             item
             for item in items
             if item.get_closest_marker("long")
+            and not self._everything
             and str(item.path.relative_to(config.rootpath)) not in self._affected
         }
         config.hook.pytest_deselected(items=[*left_out])
         items[:] = [item for item in items if item not in left_out]
+        slow = {item.path for item in items if any(map(item.get_closest_marker, ("long", "timeout")))}
+        items.sort(key=lambda item: item.path not in slow)
 
     def pytest_deselected(self, items: list[pytest.Item]) -> None:
         """Count what is left out."""

@@ -17,6 +17,8 @@ from dxlrun.testing import plan_of
 from dxlrun_view.live_robot import LiveRobot
 from dxlsim.bus.ledger import read_ledger
 
+pytestmark = pytest.mark.long
+
 NAME = "open_manipulator_x_space"
 ARM = example(NAME, "link1", "end_effector_link", "joint1", "joint2", "joint3", "joint4")
 TICK = math.tau / 4096

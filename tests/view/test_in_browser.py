@@ -12,6 +12,8 @@ from dxlrun_view.curves import Curve, Moment
 from dxlrun_view.recorded_robot import RecordedRobot
 from dxlrun_view.shown import LiveEvent, SourceProperties, ViewedController, ViewedRobot
 
+pytestmark = pytest.mark.long
+
 VISIBLE = "(selector => document.querySelector(selector).offsetParent !== null)"
 """In the page: whether an element is visible."""
 ENABLED = """[...document.querySelectorAll('fieldset :is(input, button, select)')]
