@@ -4,7 +4,8 @@ Protocol 2.0 gets one broadcast ping per rate, which each servo answers in its o
 pinged ID by ID, because all its servos would answer a broadcast at once (e-Manual, Protocol 1.0 and 2.0,
 Ping). Protocol 2.0 is also pinged ID by ID at a rate where a node answered: boards with the maker's
 Dynamixel2Arduino do not answer a broadcast ping (utility/slave.cpp). After bytes that are not a whole reply
-every ID is pinged again, with longer timeouts.
+every ID is pinged again, with longer timeouts. Few IDs at one rate are, too, if none answers: a packet may be
+lost, and a busy machine late.
 """
 
 from __future__ import annotations
@@ -107,6 +108,7 @@ def scan(tool: ToolLine, search: Search = EVERYWHERE, progress: Progress = lambd
     found: list[FoundServo] = []
     left_out: list[int] = []
     lines = search.lines()
+    again = len(lines) == 1 and 0 < len(search.ids) <= FEW
     for index, (protocol, baud_rate) in enumerate(lines):
         if not tool.speak(protocol, baud_rate):
             left_out.append(baud_rate)
@@ -118,7 +120,7 @@ def scan(tool: ToolLine, search: Search = EVERYWHERE, progress: Progress = lambd
 
         ids = search.ids or tuple(range(dialect_of(protocol).HIGHEST_ID + 1))
         beat(0.0)
-        found += tool.run_program(_search(tool, ids, beat))
+        found += tool.run_program(_search(tool, ids, beat, again=again))
     return ScanResult(tuple(found), tuple(dict.fromkeys(left_out)))
 
 
@@ -149,7 +151,9 @@ def _knock(tool: ToolLine, servo_id: int, tries: int) -> Program[bool]:
     return False
 
 
-def _search(tool: ToolLine, ids: Sequence[int], beat: Callable[[float], None]) -> Program[list[FoundServo]]:
+def _search(
+    tool: ToolLine, ids: Sequence[int], beat: Callable[[float], None], *, again: bool
+) -> Program[list[FoundServo]]:
     line, heard = tool.line, tool.heard
     # Replies of the previous rate are still to come.
     yield listen_transaction(DISCARD_NS if line.dialect.PROTOCOL == 1.0 else LATE_NS)
@@ -170,6 +174,8 @@ def _search(tool: ToolLine, ids: Sequence[int], beat: Callable[[float], None]) -
     # Noise may be replies that collided: ping every ID with full timeouts.
     if heard.noise:
         there |= yield from _one_by_one(tool, ids, None, beat)
+    if again and not there:
+        there = yield from extend_timeouts(_ping_again(tool, ids, beat))
     found: list[FoundServo] = []
     for servo_id in sorted(there):
         found.append((yield from extend_timeouts(read_servo(line, servo_id, tool.port.name))))
@@ -198,6 +204,13 @@ def _one_by_one(
     yield listen_transaction(LATE_NS if len(ids) > FEW else LATE_OF_FEW_NS)
     there |= yield from extend_timeouts(_answering(line, suspected))
     return there | (heard.ids & set(ids))
+
+
+def _ping_again(tool: ToolLine, ids: Sequence[int], beat: Callable[[float], None]) -> Program[set[int]]:
+    there: set[int] = set()
+    for _ in range(_TRIES_ALONE - 1):
+        there = there or (yield from _one_by_one(tool, ids, None, beat))
+    return there
 
 
 def _answering(line: Line, suspected: Sequence[int]) -> Program[set[int]]:
