@@ -7,7 +7,7 @@ import ctypes
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import partial
+from functools import cache, partial
 from typing import ClassVar, NamedTuple
 
 from dxlsim.motion.compiled_mechanics import STRUCTS, ShownQuantity, library
@@ -17,6 +17,7 @@ from dxlsim.motion.motor import Motor
 from dxlsim.registers.access import ShaftItems
 from dxlsim.registers.memory import Memory, value_range
 from dxlsim.simulation_plan import Load
+from dxlwire.control_table import ControlItem
 
 _ENCODINGS = {"unsigned": 0, "twos_complement": 1, "sign_magnitude": 2}  # As in mechanics.c
 
@@ -119,17 +120,7 @@ class Shaft(ABC):
         for name in {"present_voltage", "present_input_voltage"} & items.keys():
             common[name] = LiveItem(ShownQuantity.VOLTAGE, items[name].scale)
         known = {name: live for name, live in {**common, **self.live_items()}.items() if name in items}
-        self._items = (STRUCTS["LiveItem"] * len(known))()
-        for struct, (name, live) in zip(self._items, known.items(), strict=True):
-            lowest, highest = value_range(items[name])
-            struct.quantity, struct.unit, struct.times, struct.zero = live[:4]
-            struct.lowest = lowest if live.lowest is None else live.lowest
-            struct.highest = highest if live.highest is None else live.highest
-            struct.sign_bit, struct.address, struct.size = (
-                live.sign_bit,
-                items[name].address,
-                items[name].size,
-            )
+        self._items = _structs(tuple((items[name], live) for name, live in known.items()))
         self.state.items, self.state.item_count = ctypes.addressof(self._items), len(known)
 
     def show_range(self, address: int, length: int) -> None:
@@ -245,6 +236,20 @@ class Shaft(ABC):
     @property
     @abstractmethod
     def _controls_position(self) -> bool: ...
+
+
+@cache
+def _structs(shown: tuple[tuple[ControlItem, LiveItem], ...]) -> ctypes.Array[ctypes.Structure]:
+    """Return the array of `LiveItem` of mechanics.c, the same for all servos that show the same: together
+    they would not fit into the processor's cache."""
+    structs = (STRUCTS["LiveItem"] * len(shown))()
+    for struct, (item, live) in zip(structs, shown, strict=True):
+        lowest, highest = value_range(item)
+        struct.quantity, struct.unit, struct.times, struct.zero = live[:4]
+        struct.lowest = lowest if live.lowest is None else live.lowest
+        struct.highest = highest if live.highest is None else live.highest
+        struct.sign_bit, struct.address, struct.size = live.sign_bit, item.address, item.size
+    return structs
 
 
 def critical_d(p: float, motor: Motor) -> float:

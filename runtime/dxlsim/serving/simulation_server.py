@@ -7,6 +7,7 @@ import ctypes
 import select
 import signal
 import socket
+import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -149,6 +150,7 @@ class Server:
     def _serve_once(self, stop: int) -> None:
         flush_ns = self._ledger.flush_due_ns()
         self._state.python_ns = NEVER_NS if flush_ns is None else flush_ns
+        self._state.alone = threading.active_count() == 1
         news = self._library.line_serve(self._address)
         if news & _RAISED:
             for bus in self._buses:

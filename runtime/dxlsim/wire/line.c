@@ -696,8 +696,8 @@ static int64_t next_delivery_ns(const Bus *b)
     return passed_ns(t, end - 1);
 }
 
-/* Take up to `most` bytes that have passed the wire as one delivery. */
-static Delivery gathered(Bus *b, int64_t now_ns, int64_t most)
+/* Take up to a burst of bytes that have passed the wire as one delivery. */
+static Delivery gathered(Bus *b, int64_t now_ns)
 {
     Delivery d = {.planned_ns = now_ns};
     Bytes data = {0};
@@ -705,7 +705,7 @@ static Delivery gathered(Bus *b, int64_t now_ns, int64_t most)
         Transmission *t = in_adapter(b, i);
         if (t->first_ns >= now_ns)
             continue;
-        int64_t first = t->given, end = first + most - data.size;
+        int64_t first = t->given, end = first + BURST - data.size;
         end = end < t->size ? end : t->size;
         if (t->due_ns > now_ns)
             while (end > first && passed_ns(t, end - 1) > now_ns)
@@ -760,20 +760,45 @@ static void split(Bus *b, Delivery whole)
     free(whole.data);
 }
 
-/* Hand a delivery over to the host, and enter what is complete with it. `handed_ns` < 0: not in real time. */
-static void hand_over(Bus *b, Delivery d, int64_t handed_ns)
+/* Hand bytes over to the host. Return how late. `handed_ns` < 0: not in real time. */
+static int64_t hand_over(Bus *b, const uint8_t *data, int64_t size, int64_t planned_ns, int64_t handed_ns)
 {
-    int64_t late_ns = handed_ns < 0 ? 0 : handed_ns - d.planned_ns;
-    for (int32_t i = 0; i < d.ended.count; i++) {
-        const Transmission *t = d.ended.at[i];
-        record(b, t->due_ns, OUT, t->note, t->data, t->size, late_ns);
-    }
-    append(&b->out, d.data, d.size);
+    int64_t late_ns = handed_ns < 0 ? 0 : handed_ns - planned_ns;
+    append(&b->out, data, size);
     if (handed_ns >= 0)
         b->line.lateness_ns[b->line.delivered % LATENESSES] = late_ns;
+    return late_ns;
+}
+
+static void record_sent(Bus *b, const Transmission *t, int64_t late_ns)
+{
+    record(b, t->due_ns, OUT, t->note, t->data, t->size, late_ns);
+}
+
+/* Hand over the next delivery that has been gathered, and enter what is complete with it. */
+static void hand_over_burst(Bus *b, int64_t handed_ns)
+{
+    Delivery d = b->burst[b->burst_at++];
+    int64_t late_ns = hand_over(b, d.data, d.size, d.planned_ns, handed_ns);
+    for (int32_t i = 0; i < d.ended.count; i++)
+        record_sent(b, d.ended.at[i], late_ns);
     clear(&d.ended);
     free(d.ended.at);
     free(d.data);
+}
+
+/* Hand over the next piece of the oldest transmission, by an adapter without a timer. */
+static void hand_over_piece(Bus *b, int64_t due_ns, int64_t handed_ns)
+{
+    Transmission *t = in_adapter(b, 0);
+    int32_t left = t->size - t->given, size = b->piece < left ? b->piece : left;
+    int64_t late_ns = hand_over(b, t->data + t->given, size, due_ns, handed_ns);
+    t->given += size;
+    if (t->given == t->size) {
+        record_sent(b, t, late_ns);
+        drop(removed(&b->arrived, 0)); /* its last byte has passed the wire */
+    }
+    b->piece = next_piece(b);
 }
 
 /* Replies */
@@ -956,17 +981,13 @@ int64_t line_drain(Bus *b, int64_t now_ns, int64_t handed_ns)
         if ((due_ns = next_delivery_ns(b)) > now_ns)
             break;
         if (b->burst_at < b->burst_count)
-            hand_over(b, b->burst[b->burst_at++], handed_ns);
+            hand_over_burst(b, handed_ns);
         else if (b->line.timer_ns) {
             b->timed_ns = due_ns;
-            split(b, gathered(b, due_ns, BURST));
+            split(b, gathered(b, due_ns));
             continue;
-        } else {
-            const Transmission *t = in_adapter(b, 0);
-            int32_t left = t->size - t->given;
-            hand_over(b, gathered(b, due_ns, b->piece < left ? b->piece : left), handed_ns);
-            b->piece = next_piece(b);
-        }
+        } else
+            hand_over_piece(b, due_ns, handed_ns);
         handed = 1;
     }
     if (handed && handed_ns >= 0)
@@ -1041,10 +1062,12 @@ static int is_readable(const Node *n, int32_t address, int32_t length)
  * Addresses beyond the table [i]. */
 static void append_registers(Bytes *to, const Node *n, int32_t address, int32_t length)
 {
+    uint8_t *data = room_for(to, length);
     for (int32_t at = address; at < address + length; at++) {
         int32_t target = n->alias[at] < 0 ? at : value_at(n, n->alias[at], 2);
-        append_byte(to, target < n->size ? n->memory[target] : 0);
+        *data++ = target < n->size ? n->memory[target] : 0;
     }
+    to->size += length;
 }
 
 /* Instructions */
@@ -1681,7 +1704,8 @@ typedef struct {
     int64_t early_ns;              /* time by which a sleep ends later than requested, at least */
     int32_t count, waiting;        /* `waiting`: descriptor of epoll */
     int32_t watched, news;
-    int32_t single, unused;        /* 1: Python looks at the shafts after each event */
+    int32_t single;                /* 1: Python looks at the shafts after each event */
+    int32_t alone;                 /* 1: no other thread needs Python's lock */
 } Server;
 
 static int64_t clock_ns(void)
@@ -1843,10 +1867,11 @@ int64_t line_early(int64_t early_ns, int64_t late_ns)
     return early_ns < MOST_EARLY_NS ? early_ns : MOST_EARLY_NS;
 }
 
-/* Wait, without Python's lock, until a host writes, a delivery is due, or other work, which need not be punctual. */
+/* Wait until a host writes, a delivery is due, or other work, which need not be punctual. Other threads get Python's
+ * lock. */
 static void wait_for_event(Server *s, int64_t due_ns, int64_t easy_ns)
 {
-    void *thread = s->release();
+    void *thread = s->alone ? NULL : s->release();
     int64_t wake_ns = due_ns == NEVER ? NEVER : due_ns - s->early_ns;
     int64_t until_ns = easy_ns < wake_ns ? easy_ns : wake_ns, left_ns = until_ns - clock_ns();
     struct pollfd one = {s->waiting, POLLIN, 0};
@@ -1860,7 +1885,8 @@ static void wait_for_event(Server *s, int64_t due_ns, int64_t easy_ns)
         left_ns = 1;
     while (left_ns <= 0 && until_ns == wake_ns && clock_ns() < due_ns) /* rarely: most sleeps end later */
         ;
-    s->acquire(thread);
+    if (thread)
+        s->acquire(thread);
 }
 
 /* Deliver what is due, and receive what hosts have written. */
