@@ -313,8 +313,10 @@ def _compiled(source: Path, text: str, urdf: str | None) -> float:
     try:
         compiled = compile_texts({"robot.yaml": text}, {}, urdf)
     except InputError as error:
-        first = str(error).splitlines()[0].partition(": ")[2]
-        what, _, fix = first.partition("; ")
-        problem = Problem(Mark(str(source)), f"its robot file would be invalid: {what}", fix or "correct it")
-        raise InputError([problem]) from None
+        if not error.problems:
+            raise
+        first = error.problems[0]
+        raise InputError(
+            [Problem(Mark(str(source)), f"its robot file would be invalid: {first.what}", first.fix)]
+        ) from None
     return max((bus.budget.total_ns for bus in compiled.plan.buses), default=0) * 1e-9

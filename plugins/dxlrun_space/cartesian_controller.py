@@ -269,7 +269,7 @@ class CartesianController(Controller[CartesianParameters]):
 
     def _forget(self) -> None:
         self._task: Task | None = None
-        self._moves = self._brakes = False
+        self._moves = self._brakes = self._is_trying = False
         self._goal: Goal | None = None
         self._waiting: PoseGoal | None = None
         self._is_cancelled = False
@@ -290,11 +290,13 @@ class CartesianController(Controller[CartesianParameters]):
         self._hold_joints()
         self._write()
 
-    def _hold_joints(self) -> None:
-        """Hold the positions that were sent, or else the measured ones."""
+    def _hold_joints(self) -> str:
+        """Hold the positions that were sent, or else the measured ones; return a joint that has neither."""
         goals, states = self.context.goals.position, self.context.states.position
         held = np.where(np.isnan(goals), states, goals)
-        self._at = () if np.isnan(held).any() else tuple(held.tolist())
+        lacking = np.isnan(held)
+        self._at = () if lacking.any() else tuple(held.tolist())
+        return "" if self._at else self.context.joints[int(lacking.argmax())]
 
     def _write(self) -> None:
         if self._at:
@@ -305,21 +307,21 @@ class CartesianController(Controller[CartesianParameters]):
     def on_goal(self, goal: Goal, data: NDArray[np.float64], time_ns: int) -> None:
         """Plan a motion to the pose; a motion that is under way brakes first."""
         self._goal, self._is_cancelled, self._feedback_ns = goal, False, time_ns + FEEDBACK_NS
-        if self._at:
-            self._pass_to(unpacked(data, POSES))
-        else:
-            joint = self.context.joints[int(np.isnan(self.context.states.position).argmax())]
+        if joint := "" if self._at else self._hold_joints():
             self._end(Outcome.ABORTED, f"joint {joint} has not answered yet")
+        else:
+            self._pass_to(unpacked(data, POSES))
 
     def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
         """Follow a twist; a pose that is under way ends as preempted. Or plan without moving."""
         if kind == "twist":
-            if self._at:
+            if self._at or not self._hold_joints():
                 self._follow(unpacked(data, TWISTS), time_ns)
         elif self._moves or self._goal is not None:
             self._publish("the arm moves; ask again when it rests")
         else:
-            self._task = self._try(unpacked(data, POSES))
+            self._drop_plan("replaced by a newer request")
+            self._task, self._is_trying = self._try(unpacked(data, POSES)), True
 
     def _follow(self, twist: TwistGoal, time_ns: int) -> None:
         self._turns_with_tip = twist.frame == self._chain.tip
@@ -353,6 +355,7 @@ class CartesianController(Controller[CartesianParameters]):
 
     def _begin_task(self) -> None:
         """Begin what waits, from rest."""
+        self._drop_plan("the arm moves; ask again when it rests")
         self._task, self._moves, self._brakes = None, False, False
         if self._is_cancelled:
             self._is_cancelled = False
@@ -406,6 +409,7 @@ class CartesianController(Controller[CartesianParameters]):
 
     def _abandon(self) -> None:
         """Hold the goals that were sent: a joint is lost, and the runtime holds the others."""
+        self._drop_plan("a joint is lost; ask again when it answers")
         self._hold_joints()
         text = ""
         if self._target is not None and self._at:
@@ -447,10 +451,17 @@ class CartesianController(Controller[CartesianParameters]):
     def _try(self, asked: PoseGoal) -> Task:
         """Plan a motion from rest to a pose, and publish it."""
         found = yield from self._planned(asked)
+        self._is_trying = False
         if isinstance(found, NoPath):
             self._publish(found.text)
         else:
             self._publish(_remark(found, asked), found.last, found.duration_s)
+
+    def _drop_plan(self, reason: str) -> None:
+        """Answer a request for a plan that is not finished with the reason why it never will be."""
+        if self._is_trying:
+            self._is_trying = False
+            self._publish(reason)
 
     def _publish(self, text: str, positions: Positions = (), seconds: float = math.nan) -> None:
         x, y, z = (self._target or BASE).translation

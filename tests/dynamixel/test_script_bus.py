@@ -244,7 +244,7 @@ def test_writer_sends_each_goal_in_each_call_within_the_range_of_the_item(script
     sent = script.sent()
     assert sent == [sent[0]] * 5
     assert (sent[0][7], sent[0][8], sent[0][10]) == (SYNC_WRITE, 112, 8)  # the two items are one block
-    write([3.0, 2.0, 1.0], [9e3, -1.0, np.inf])
+    write([3.0, 2.0, 1.0], [9e3, -1.0, 9e9])
     (packet,) = script.sent()
     assert [int.from_bytes(packet[at : at + 4], "little") for at in (13, 22, 31)] == [32767, 0, 32767]
     with pytest.raises(TypeError, match="takes 2 values"):
@@ -272,6 +272,15 @@ def test_servo_with_a_value_of_nan_gets_nothing(script, items):
     write([np.nan, 3.0, 3.0], [2.0, 2.0, np.nan])  # a goal of NaN would be the end of the range
     (packet,) = script.sent()
     assert (packet[12], len(packet)) == (2, 12 + 9 + 2)
+    for value, shown in (
+        (None, "1 is None"),
+        ([1.0, np.inf, 1.0], "2 is inf"),
+        ([1, 1, None], "3 is None"),
+    ):
+        for values in ((value, 1.0), (1.0, value)):
+            with pytest.raises(ValueError, match=f"{items[values.index(value)]} of ID {shown}"):
+                write(*values)
+    assert script.sent() == []
 
 
 def test_goals_of_many_turns_are_sent_as_they_are(script):

@@ -205,6 +205,13 @@ def test_a_plan_is_published_and_moves_nothing() -> None:
     assert stage.messages[-1][1].text == "the arm moves; ask again when it rests"
     played(stage, 3.0)
     assert stage.goal.ended[0][0] == "reached"
+    count = len(stage.messages)
+    for _ in range(2):
+        stage.give("plan", x=0.9)  # sought in many cycles
+        played(stage, 0.02)
+    stage.send(None, "pose", dz=-0.05)
+    texts = [plan.text for _, plan in stage.messages[count:]]
+    assert texts == ["replaced by a newer request", "the arm moves; ask again when it rests"]
 
 
 def test_a_cancel_brakes_on_the_line() -> None:
@@ -253,6 +260,13 @@ def test_a_joint_that_has_not_answered_refuses_goals() -> None:
     stage.activate()
     stage.send(0.0, "pose", dz=0.1)
     assert stage.goal.ended[0][1] == "joint joint3 has not answered yet"
+    stage.states.position[2] = READY[2]  # but no update yet
+    stage.send(None, "pose", dz=0.02)
+    played(stage, 3.0)
+    assert stage.goal.ended[0][0] == "reached"
+    stage.states.position[:] = READY
+    stage.states.position[2] = stage.sent.position[2] = math.nan
+    stage.activate()
     stage.give("twist", vz=0.1, frame="link5")  # has no effect
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -38,6 +39,10 @@ def compile_texts(
     with tempfile.TemporaryDirectory(prefix="dxlrun-replay-") as directory:
         root = Path(directory).resolve()
         home = root.joinpath(*["up"] * 8)  # A file may include files next to its own directory or above it.
+
+        def shorten(text: str) -> str:
+            return text.replace(f"{home}/", "")
+
         for relative, text in files.items():
             _write(root, home / relative, text)
         try:
@@ -47,7 +52,11 @@ def compile_texts(
                     _write(root, home / description.robot.model.urdf, urdf)
                 return compile_robot(description, [])
         except InputError as error:
-            raise InputError(str(error).replace(f"{home}/", "")) from error
+            problems = [
+                replace(one, mark=replace(one.mark, file=shorten(one.mark.file)), what=shorten(one.what))
+                for one in error.problems
+            ]
+            raise InputError(problems or shorten(str(error))) from error
 
 
 def _write(root: Path, path: Path, text: str) -> None:

@@ -32,7 +32,7 @@ from dxlrun.contract.controller import SpeedPeak
 from dxlrun.control.controllers.goal_registry import PlayedPart
 from dxlrun.control.steering import Play
 from dxlrun.description.motion import MotionDescription
-from dxlrun.errors import InputError, Problem, suggestion
+from dxlrun.errors import InputError, Problem, suggestion, what_and_fix
 from dxlrun.plan.loop_plan import SETTLE_NS, JointPlan, ScheduledCommand
 from dxlrun.remote.preparation import PreparedCommand, ResolvedController, travel_s
 
@@ -263,7 +263,7 @@ def _check(part: _ControllerSamples, running: RunSnapshot, problems: Problems) -
 
 def _refused(warning: Problem) -> Problem:
     """Return a warning of the start-up check as an error: in a run, the loop would hold the joint instead."""
-    return replace(warning, severity="error", fix=warning.fix.rpartition("; ")[2])
+    return replace(warning, severity="error", fix=what_and_fix(warning.fix)[1])
 
 
 def _way_ns(part: _ControllerSamples, running: RunSnapshot) -> int:

@@ -250,11 +250,12 @@ class ServoWriter:
 
     def __call__(self, *values: ArrayLike) -> None:
         """Send the values, one argument for each item: a number for all servos, or one for each. Values are
-        limited to the item's range; a servo whose first value is NaN gets nothing.
+        limited to the item's range; a servo with a NaN among its values gets nothing.
 
         No servo acknowledges a sync write.
 
         Raises:
+            ValueError: A value is infinite or None, or the number of values is wrong.
             PortError: The line is lost.
         """
         with self._lock:

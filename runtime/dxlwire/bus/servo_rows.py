@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 
@@ -27,15 +28,11 @@ class ServoStates(msgspec.Struct, eq=False):
 
     ids: tuple[int, ...]
     valid: NDArray[np.bool_]  # True for each servo that answered
+    alert: NDArray[np.bool_]
+    """True for each servo whose last reply reported an error, such as an overload; the item
+    `hardware_error_status` has it."""
     _numbers: Floats
-    _alert: NDArray[np.bool_]
     _places: Mapping[str, slice]
-
-    @property
-    def alert(self) -> NDArray[np.bool_]:
-        """True for each servo whose last reply reported an error, such as an overload; the item
-        `hardware_error_status` has it."""
-        return self._alert.copy()
 
     @property
     def age(self) -> Floats:
@@ -89,7 +86,7 @@ class ReadRows(ABC):
         values = self._numbers[: len(items) * count]
         self._arrays = ServoRows(values, np.zeros(count, np.bool_), age_ns)
         self._values: Floats = values.reshape(len(items), count)
-        self._alert = np.zeros(count, np.bool_)  # States share it, so it is replaced as a whole
+        self._alert = np.zeros(count, np.bool_)
         # In Protocol 1.0 each bit of the error byte is a state of the servo.
         self._alert_bits = session.line.dialect.ALERT or 0xFF
 
@@ -109,7 +106,7 @@ class ReadRows(ABC):
     def newest_state(self) -> ServoStates:
         """Return a copy of the values of the newest cycle."""
         valid = self._arrays.valid.copy()
-        return ServoStates(self.ids, valid, self._numbers.copy(), self._alert, self._places)
+        return ServoStates(self.ids, valid, self._alert.copy(), self._numbers.copy(), self._places)
 
 
 class WrittenRows(ABC):
@@ -121,13 +118,16 @@ class WrittenRows(ABC):
         check_different(items)
         session.cycles += 1
         self._goals: Floats = np.full((len(COMMAND_INTERFACES), len(servos)), np.nan)
-        self._rows = tuple(self._goals[: len(items)])
+        self._given = self._goals[: len(items)]
+        self._rows = tuple(self._given)
+        self._items, self._servos = tuple(items), tuple(servo.servo_id for servo in servos)
 
     def send_values(self, values: Sequence[ArrayLike]) -> None:
         """Send one packet for each block of items, which no servo acknowledges.
 
         Raises:
-            ValueError: An argument has more or fewer values than servos, or no numbers.
+            ValueError: An argument has more or fewer values than servos, or a value is not a finite number or
+                NaN.
             PortError: The line is closed or lost.
         """
         rows = self._rows
@@ -142,7 +142,17 @@ class WrittenRows(ABC):
             if (given := np.size(values[index])) in (1, servos := self._goals.shape[1]):
                 raise  # Not numbers
             raise ValueError(f"argument {index + 1}: {given} values for {servos} servos") from None
+        if not np.isfinite(self._given).all():
+            self._refuse_values(values)
         self.send_goals()
+
+    def _refuse_values(self, values: Sequence[ArrayLike]) -> None:
+        """Raise ValueError for a value that is infinite or None, of which numpy makes NaN."""
+        for item, value in zip(self._items, values, strict=True):
+            given = np.broadcast_to(np.asarray(value, object), len(self._servos))
+            for servo_id, number in zip(self._servos, given, strict=True):
+                if number is None or math.isinf(number):
+                    raise ValueError(f"{item} of ID {servo_id} is {number}; give a number, or NaN for none")
 
     @abstractmethod
     def send_goals(self) -> None:
