@@ -10,12 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.kit.loops import plan_of
 
-from dxlrun.control.controllers.claims import (
-    ControllerSnapshot,
-    SwitchStep,
-    conflicts,
-    conflicts_text,
-)
+from dxlrun.control.controllers.claims import ControllerSnapshot, SwitchStep, conflicts, conflicts_text
 from dxlrun.control.controllers.update_order import (
     UpdateEdge,
     above,

@@ -9,13 +9,7 @@ from hypothesis import strategies as st
 
 from dxlsim.motion.compiled_mechanics import library
 from dxlsim.motion.control_law import LIMP, ServoCommand
-from dxlsim.motion.mechanics import (
-    AMBIENT_C,
-    COOLING_S,
-    STALLED_RISE_C,
-    STEP_NS,
-    Mechanics,
-)
+from dxlsim.motion.mechanics import AMBIENT_C, COOLING_S, STALLED_RISE_C, STEP_NS, Mechanics
 from dxlsim.motion.motor import Motor, motor_of
 from dxlsim.simulation_plan import NO_LOAD, Load
 from dxlwire.control_table import all_tables

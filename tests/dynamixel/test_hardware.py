@@ -6,14 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 from tests.kit.line_faults import corrupt_next, delay_next, other_host, truncate_next
-from tests.kit.rigs import (
-    X_IDS,
-    goals_in,
-    make_plan,
-    make_rig,
-    make_x,
-    start_rig,
-)
+from tests.kit.rigs import X_IDS, goals_in, make_plan, make_rig, make_x, start_rig
 
 from dxlrun.channels.event_records import EventCode, Severity
 from dxlrun.dynamixel.servo.item_access import access_servo

@@ -23,11 +23,7 @@ from msgspec.structs import replace
 
 import dxlrun
 from dxlrun.channels.child_processes import memory_file
-from dxlrun.channels.heartbeat import (
-    LineProgress,
-    SimulationProgress,
-    create_progress,
-)
+from dxlrun.channels.heartbeat import LineProgress, SimulationProgress, create_progress
 from dxlrun.compile.robot_compiler import compile_files
 from dxlrun.dynamixel.remedies import CHECK, INJECTED, choose_remedy, describe_late_start, late_replies
 from dxlrun.dynamixel.tools.tool_port import TunablePort

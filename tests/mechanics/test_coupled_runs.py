@@ -22,9 +22,7 @@ from dxlrun.features.mechanics.joint_hardware import CouplingCheck
 from dxlrun.log.log_reader import read_log
 from dxlrun.run import virtual_run
 from dxlrun.run.virtual_run import VirtualRobot
-from dxlrun_controllers.group import (
-    JointGroupPositionController,
-)
+from dxlrun_controllers.group import JointGroupPositionController
 
 pytestmark = pytest.mark.long
 

@@ -4,13 +4,7 @@ from fractions import Fraction
 
 import pytest
 
-from dxlwire.control_table import (
-    CAPABILITIES,
-    ControlTable,
-    all_tables,
-    find_table,
-    models_by_number,
-)
+from dxlwire.control_table import CAPABILITIES, ControlTable, all_tables, find_table, models_by_number
 
 TABLES = all_tables()
 PROTOCOL1 = {
