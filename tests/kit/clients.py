@@ -63,6 +63,7 @@ class Ask:
     controller: str
     kind: str
     command: dict[str, object]
+    lease_s: float = 0.0
 
 
 def clients_of(robot: VirtualRobot, asks: Sequence[Ask]) -> Clients:
@@ -75,7 +76,8 @@ def clients_of(robot: VirtualRobot, asks: Sequence[Ask]) -> Clients:
             else ask(one.kind, one.command)
         )
         cycle = math.ceil(round(one.at_s * 1e9) / robot.plan.loop.period_ns)
-        asked.setdefault(cycle, []).append(replace(command, number=number))
+        lease_ns = round(one.lease_s * 1e9)
+        asked.setdefault(cycle, []).append(replace(command, number=number, lease_ns=lease_ns))
     return Clients(robot, asked)
 
 

@@ -1,7 +1,7 @@
 """A robot file on virtual time: clients ask at times, faults happen, the shafts of all joints are sampled."""
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,6 @@ from tests.kit.wire import all_writes
 from dxlrun.channels.answers import Answer, Completion
 from dxlrun.channels.commands import CommandMessage
 from dxlrun.channels.cycle import Floats
-from dxlrun.channels.event_records import EventCode
 from dxlrun.log.log_reader import Log, read_log
 from dxlrun.testing import VirtualRobot, simulated_robot
 from dxlsim.faults.fault import parse_fault
@@ -95,17 +94,3 @@ class SampledRun:
             for t_ns, one, first, data in all_writes(self.robot.ledger.entries, self.plan.buses[0])
             if one == servo and first <= address <= first + len(data) - size
         ]
-
-
-def texts(log: Log, *codes: EventCode, source: str | None = None) -> list[str]:
-    """Return the texts of events of some kinds, of one source or of all."""
-    return [one.text for one in log.events if one.code in codes and source in (None, one.source)]
-
-
-def changes_of(values: Iterable[int]) -> Iterator[int]:
-    """Yield each value that differs from the one before it."""
-    before = None
-    for value in values:
-        if value != before:
-            yield value
-        before = value

@@ -397,6 +397,17 @@ def switch(story: Story, activate: str | None, deactivate: str | None) -> None:
     story.ask("switch", activate=(activate or "").split(), deactivate=(deactivate or "").split())
 
 
+def flicker(story: Story, joint: str) -> None:
+    """Let a servo answer in every second 20 ms from now on, without an end."""
+    bus = next(bus for bus in story.robot.buses if story.servos[joint][0] in bus.servos)
+
+    def turn(on: bool) -> None:
+        story.servos[joint][0].silence(on)
+        bus.at(bus.now_ns + 20_000_000, partial(turn, not on))
+
+    turn(True)
+
+
 def servo_action(name: str, *values: Any) -> Callable[[Story, str], None]:
     return lambda story, joint: getattr(story.servos[joint][0], name)(*values)
 
@@ -452,6 +463,7 @@ ACTIONS: dict[str, Callable[..., None]] = {
     r"(\w+) commands (\S+)": requesting("command"),
     r"hand (\w+) to (\S+)": Story.turn,
     r"stick (\w+) (\w+) (\d+)": Story.stick,
+    r"flicker (\w+)": flicker,
     r"silence (\w+)": servo_action("silence"),
     r"answer (\w+)": servo_action("silence", False),
     r"overload (\w+)": servo_action("trigger_overload"),

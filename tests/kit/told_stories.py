@@ -13,17 +13,20 @@ The texts have the form of `tests/kit/cases.py`. The head is a robot file, or a 
       mute servo=2 at=500ms for=60ms   replies are lost, while the servo executes its instructions
       at 0.2 arm trajectory {points: [{time: 1, positions: [0.7, 0]}]}
       at 0.9 cancel {controller: arm}
+      at 1 head positions {positions: [0.1]} for 0.2 s     a stream that ends so long after
       => goal arm missed joint grip is...
       => shaft 2 at 2.9: 10 to 20 deg
 
 Expected are each goal that ends, events (`=> event arm turns...`, `=> no event ...`; `any` is each source;
 `=> times 4 arm turns...` counts them), shafts, deg from the reference, and columns of the log: `=> position
 elbow from 1.5 to 2: 0.29 to 0.31`, with `spread` before the numbers for the difference of the largest and the
-smallest one, and `step` for the largest one of neighbours. Without a time it is the last cycle. `=> topic
-/pid/state: 0 to 30` is about the ms between its messages, `=> lasts 1.5 to 2 s` about the whole run. `=>
-wrote 1 led: 1 0` has the values that a servo was sent, by the ledger. `...` stands for any text. Each run is
-equal to its replay. `needs physics` names an extra. A case may have several runs: by `NAME = a | b` its
-`NAME` stands for one text after the other.
+smallest one, `step` for the largest one of neighbours, `bend` for that of two steps, `in 100 ms` for the
+largest change in a time. Without a time it is the last cycle. `=> topic /pid/state: 0 to 30` is about the ms
+between its messages, `=> lasts 1.5 to 2 s` about the whole run. `=> wrote 1 led: 1 0` has the values that a
+servo was sent, by the ledger, and `=> sent 1/goal_velocity from 1 to 2: step 0 to 4` measures them. `...`
+stands for any text. Each run is equal to its replay. `needs physics` names an extra. A case may have several
+runs: by `NAME = a | b` its `NAME` stands for one text after the other, and two do by `NAME OTHER = a ; b |
+c ; d`.
 """
 
 import json
@@ -58,8 +61,9 @@ from dxlwire.control_table import find_table
 ROBOTS = Path(__file__).parents[2] / "robots"
 LOOK_NS = 10_000_000
 WHERE = r"(?: at (?P<at>[\d.]+)| from (?P<begin>[\d.]+) to (?P<end>[\d.]+))?"
-NUMBERS = r": (?:(?P<spread>spread|step) )?(?P<low>[-\d.]+|nan)(?: to (?P<high>[-\d.]+))?(?: deg)?"
-MEASURED = re.compile(rf"(?P<column>\w+) (?P<name>[\w./]+){WHERE}{NUMBERS}$")
+HOW = r"(?:(?P<measure>spread|step|bend|in (?P<ms>\d+) ms) )?"
+NUMBERS = r"(?P<low>[-\d.]+|nan)(?: to (?P<high>[-\d.]+))?(?: deg)?"
+MEASURED = re.compile(rf"(?P<column>\w+) (?P<name>[\w./]+){WHERE}: {HOW}{NUMBERS}$")
 
 
 class Story:
@@ -108,10 +112,10 @@ class Story:
             self.ask(line)
 
     def ask(self, line: str) -> None:
-        match = re.match(r"at ([\d.]+) (?:(\w+) )?(\w+) (\{.*\})$", line)
+        match = re.match(r"at ([\d.]+) (?:(\w+) )?(\w+) (\{.*\})(?: for ([\d.]+) s)?$", line)
         assert match, "this line is no request, fault, change, `run` or `play`"
-        at, controller, kind, values = match.groups()
-        self.asks.append(Ask(float(at), controller or "", kind, yaml.safe_load(values)))
+        at, controller, kind, values, lease = match.groups()
+        self.asks.append(Ask(float(at), controller or "", kind, yaml.safe_load(values), float(lease or 0)))
 
     def perform(self) -> None:
         """Run, compare with the replay, and keep the log and where the shafts were."""
@@ -149,7 +153,9 @@ class Story:
                     bus.at(t_ns, look)
 
     def _look(self, bus: SimulatedBus, number: int) -> None:
-        self.shafts[number].append(bus.servo(number).shaft_angle)
+        servo = bus.servo(number)
+        servo.advance_to(bus.now_ns)
+        self.shafts[number].append(servo.shaft_angle)
 
     def expect(self, line: str) -> None:
         """Check a line of what is expected."""
@@ -176,7 +182,7 @@ class Story:
         elif word == "wrote":
             servo, _, rest = rest.partition(" ")
             item, _, values = rest.partition(":")
-            found = list(self._written(int(servo), item))
+            found = [value for _, value in self._written(int(servo), item)]
             assert found == [int(value) for value in values.split()], found
         elif word == "fails":
             assert matches(f"{self.result.reason}, then {self.result.last}: {self.result.detail}", rest)
@@ -186,29 +192,33 @@ class Story:
             assert match, "this is neither a goal, an event, a shaft nor a column of the log"
             found = self.values(match["column"], match["name"], match)
             low, high = float(match["low"]), float(match["high"] or match["low"])
-            if match["spread"]:
-                found = np.array(
-                    [np.ptp(found) if match["spread"] == "spread" else np.abs(np.diff(found)).max()]
-                )
             assert found.size
             inside = [
                 low - 1e-9 <= one <= high + 1e-9 or (math.isnan(one) and math.isnan(low)) for one in found
             ]
             assert all(inside), (min(found), max(found))
 
-    def _written(self, number: int, name: str) -> Iterator[int]:
-        """Yield the values of an item that a servo was sent, by the ledger."""
+    def _written(self, number: int, name: str) -> Iterator[tuple[float, int]]:
+        """Yield the values of an item that a servo was sent, by the ledger, each with its time, s."""
         for bus in self.virtual.plan.buses:
+            entries = [entry for entry in self.virtual.ledger.entries if entry.bus == bus.name]
             for servo in (one for one in bus.servos if one.servo_id == number):
                 item = find_table(servo.model, bus.protocol).items[name]
-                for _, servo_id, first, data in all_writes(self.virtual.ledger.entries, bus):
+                for t_ns, servo_id, first, data in all_writes(entries, bus):
                     end = item.address + item.size - first
                     if servo_id == number and first <= item.address and end <= len(data):
-                        yield int.from_bytes(data[item.address - first : end], "little")
+                        yield t_ns * 1e-9, int.from_bytes(data[item.address - first : end], "little")
 
     def values(self, column: str, name: str, match: re.Match[str]) -> Any:
+        """Return what a line is about: values, or what it measures of them."""
+        period_s = self.virtual.plan.loop.period_ns * 1e-9
         if column == "topic":
             return np.diff(open_log(self.folder / "run.mcap").columns(name)["t_ns"]) / 1e6
+        if column == "sent":
+            servo, _, item = name.partition("/")
+            written = np.array([*self._written(int(servo), item)])
+            begin, end = float(match["begin"] or written[-1, 0]), float(match["end"] or math.inf)
+            return measured(written[(begin <= written[:, 0]) & (written[:, 0] < end), 1], match, period_s)
         if column == "shaft":
             rows = np.degrees(np.array(self.shafts[int(name)]) - self.middle(int(name)))
             period_s = LOOK_NS * 1e-9
@@ -217,9 +227,9 @@ class Story:
             if column == "source_state":
                 names = [f"{one}/{state}" for one, each in self.log.header.sources.items() for state in each]
             rows = self.log.cycles[column][:, list(names).index(name)]
-            period_s = self.virtual.plan.loop.period_ns * 1e-9
         if match["begin"]:
-            return rows[round(float(match["begin"]) / period_s) : round(float(match["end"]) / period_s)]
+            part = slice(*(round(float(match[end]) / period_s) for end in ("begin", "end")))
+            return measured(rows[part], match, period_s)
         return rows[[round(float(match["at"]) / period_s) if match["at"] else -1]]
 
     def middle(self, number: int) -> float:
@@ -232,6 +242,18 @@ class Story:
         assert not self.goals, self.goals
         if self.result is not None:
             assert (self.result.reason, self.result.detail) == ("ended", "")
+
+
+def measured(values: Any, match: re.Match[str], period_s: float) -> Any:
+    """Return values of each period, or the one number that a line measures of them."""
+    if match["measure"] == "spread":
+        return np.array([np.ptp(values)])
+    if match["measure"] == "bend":
+        return np.array([np.abs(np.diff(values, 2)).max()])
+    if match["measure"]:
+        apart = round(float(match["ms"]) * 1e-3 / period_s) if match["ms"] else 1
+        return np.array([np.abs(values[apart:] - values[:-apart]).max()])
+    return values
 
 
 def matches(found: str, text: str) -> bool:
@@ -250,15 +272,18 @@ def story_parameters(folder: Path) -> Iterator[Any]:
 
 
 def variants(told: Sequence[Line]) -> Iterator[tuple[str, Sequence[Line]]]:
-    """Yield the lines of a case for each text that a name stands for."""
-    named = [re.match(r"([A-Z]+) = (.*)", line.text) for line in told]
-    name, texts = next((one.groups() for one in named if one), ("", ""))
-    if not name:
+    """Yield the lines of a case for each text that its names stand for."""
+    named = [re.match(r"([A-Z]+(?: [A-Z]+)*) = (.*)", line.text) for line in told]
+    first = next((place for place, one in enumerate(named) if one), None)
+    if first is None:
         yield "", told
         return
-    rest = [one for one, match in zip(told, named, strict=True) if not match]
-    for text in map(str.strip, texts.split(" | ")):
-        yield f" ({text})", [line._replace(text=line.text.replace(name, text)) for line in rest]
+    names, texts = named[first].groups()  # type: ignore[union-attr]  # the place is that of a match
+    for text in texts.split(" | "):
+        rest = [*told[:first], *told[first + 1 :]]
+        for name, value in zip(names.split(), text.split(" ; "), strict=True):
+            rest = [line._replace(text=line.text.replace(name, value)) for line in rest]
+        yield from ((f" ({text}){more}", lines) for more, lines in variants(rest))
 
 
 def check_story(case: TextCase, folder: Path) -> None:

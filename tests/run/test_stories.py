@@ -1,4 +1,4 @@
-"""Joints that are lost, limp or moved by hand, by the texts in `stories`; see tests/kit/told_stories.py."""
+"""Joints that are halted, lost, limp or moved by hand, told in `stories`; see tests/kit/told_stories.py."""
 
 from pathlib import Path
 
