@@ -9,7 +9,7 @@ The texts have the form of `tests/kit/cases.py`. The head is a robot file, or a 
       play                             the motion of this text, one of `robots/motions`, or a name
       jam servo=2 at=500ms             a fault, as `dxlrun --fault` has it
       hand servo=2 by=-30 at=1300ms    a hand turns a shaft by degrees at once, against the servo
-      poke servo=2 max_torque 500      a register before the run
+      poke servo=2 max_torque 500      a register before the run, or `... 500 at=1200ms` then
       mute servo=2 at=500ms for=60ms   replies are lost, while the servo executes its instructions
       at 0.2 arm trajectory {points: [{time: 1, positions: [0.7, 0]}]}
       at 0.9 cancel {controller: arm}
@@ -21,12 +21,12 @@ Expected are each goal that ends, events (`=> event arm turns...`, `=> no event 
 `=> times 4 arm turns...` counts them), shafts, deg from the reference, and columns of the log: `=> position
 elbow from 1.5 to 2: 0.29 to 0.31`, with `spread` before the numbers for the difference of the largest and the
 smallest one, `step` for the largest one of neighbours, `bend` for that of two steps, `in 100 ms` for the
-largest change in a time. Without a time it is the last cycle. `=> topic /pid/state: 0 to 30` is about the ms
-between its messages, `=> lasts 1.5 to 2 s` about the whole run. `=> wrote 1 led: 1 0` has the values that a
-servo was sent, by the ledger, and `=> sent 1/goal_velocity from 1 to 2: step 0 to 4` measures them. `...`
-stands for any text. Each run is equal to its replay. `needs physics` names an extra. A case may have several
-runs: by `NAME = a | b` its `NAME` stands for one text after the other, and two do by `NAME OTHER = a ; b |
-c ; d`.
+largest change in a time, `most` for the largest amount. Without a time it is the last cycle. `=> topic
+/pid/state: 0 to 30` is about the ms between its messages, `=> lasts 1.5 to 2 s` about the whole run. `=>
+wrote 1 led: 1 0` has the values that a servo was sent, by the ledger, and `=> sent 1/goal_velocity from 1 to
+2: step 0 to 4` measures them. `...` stands for any text. Each run is equal to its replay. `needs physics`
+names an extra. A case may have several runs: by `NAME = a | b` its `NAME` stands for one text after the
+other, and two do by `NAME OTHER = a ; b | c ; d`, and by more lines of the same names.
 """
 
 import json
@@ -61,7 +61,7 @@ from dxlwire.control_table import find_table
 ROBOTS = Path(__file__).parents[2] / "robots"
 LOOK_NS = 10_000_000
 WHERE = r"(?: at (?P<at>[\d.]+)| from (?P<begin>[\d.]+) to (?P<end>[\d.]+))?"
-HOW = r"(?:(?P<measure>spread|step|bend|in (?P<ms>\d+) ms) )?"
+HOW = r"(?:(?P<measure>most|spread|step|bend|in (?P<ms>\d+) ms) )?"
 NUMBERS = r"(?P<low>[-\d.]+|nan)(?: to (?P<high>[-\d.]+))?(?: deg)?"
 MEASURED = re.compile(rf"(?P<column>\w+) (?P<name>[\w./]+){WHERE}: {HOW}{NUMBERS}$")
 
@@ -75,7 +75,7 @@ class Story:
         self.play, self.asks, self.faults = list[Path | str](), list[Ask](), list[Any]()
         self.hands: list[tuple[int, float, int]] = []
         self.mute: list[tuple[int, ...]] = []
-        self.pokes: list[tuple[int, str, int]] = []
+        self.pokes: list[tuple[int, str, int, int]] = []
         self.goals: list[dict[str, Any]] = []
         self.shafts: dict[int, list[float]] = {number: [] for number in shafts}
 
@@ -104,8 +104,9 @@ class Story:
             assert match, "write mute servo=ID at=TIMEms for=TIMEms"
             self.mute.append(tuple(map(int, match.groups())))
         elif word == "poke":
-            servo, item, value = rest.removeprefix("servo=").split()
-            self.pokes.append((int(servo), item, int(value)))
+            servo, item, value, *at = rest.removeprefix("servo=").split()
+            at_ms = int(at[0].removeprefix("at=").removesuffix("ms")) if at else -1
+            self.pokes.append((int(servo), item, int(value), at_ms))
         elif word in KINDS:
             self.faults.append(parse_fault(line))
         else:
@@ -130,8 +131,9 @@ class Story:
         for number, by, at_ns in self.hands:
             servo = robot.buses[0].servo(number)
             robot.buses[0].at(at_ns, partial(self._turn, servo, by))
-        for number, item, value in self.pokes:
-            robot.buses[0].servo(number).poke(item, value)
+        for number, item, value, at_ms in self.pokes:
+            poke = partial(robot.buses[0].servo(number).poke, item, value)
+            poke() if at_ms < 0 else robot.buses[0].at(at_ms * 1_000_000, poke)
         for number, at_ms, for_ms in self.mute:
             lose_replies(robot.buses[0], number, at_ms * 1_000_000, (at_ms + for_ms) * 1_000_000)
         self._watch(robot)
@@ -207,7 +209,10 @@ class Story:
                 for t_ns, servo_id, first, data in all_writes(entries, bus):
                     end = item.address + item.size - first
                     if servo_id == number and first <= item.address and end <= len(data):
-                        yield t_ns * 1e-9, int.from_bytes(data[item.address - first : end], "little")
+                        yield (
+                            t_ns * 1e-9,
+                            int.from_bytes(data[item.address - first : end], "little", signed=item.signed),
+                        )
 
     def values(self, column: str, name: str, match: re.Match[str]) -> Any:
         """Return what a line is about: values, or what it measures of them."""
@@ -246,6 +251,8 @@ class Story:
 
 def measured(values: Any, match: re.Match[str], period_s: float) -> Any:
     """Return values of each period, or the one number that a line measures of them."""
+    if match["measure"] == "most":
+        return np.array([np.abs(values).max()])
     if match["measure"] == "spread":
         return np.array([np.ptp(values)])
     if match["measure"] == "bend":
@@ -278,9 +285,11 @@ def variants(told: Sequence[Line]) -> Iterator[tuple[str, Sequence[Line]]]:
     if first is None:
         yield "", told
         return
-    names, texts = named[first].groups()  # type: ignore[union-attr]  # the place is that of a match
-    for text in texts.split(" | "):
-        rest = [*told[:first], *told[first + 1 :]]
+    names = named[first][1]  # type: ignore[index]  # the place is that of a match
+    texts = [text for one in named if one and one[1] == names for text in one[2].split(" | ")]
+    others = [line for line, one in zip(told, named, strict=True) if not one or one[1] != names]
+    for text in texts:
+        rest = others
         for name, value in zip(names.split(), text.split(" ; "), strict=True):
             rest = [line._replace(text=line.text.replace(name, value)) for line in rest]
         yield from ((f" ({text}){more}", lines) for more, lines in variants(rest))
