@@ -1,4 +1,4 @@
-"""Robots with coupled joints on the simulated bus; its ledger says what each servo was sent."""
+"""Servos of coupled joints that disagree or stand outside limits; runs: robots/stories/coupled.txt."""
 
 import math
 from functools import partial
@@ -19,14 +19,11 @@ from dxlrun.compile.simulation import simulation_of
 from dxlrun.errors import StartUpError
 from dxlrun.features.mechanics.joint_arrays import CoupledJointArrays
 from dxlrun.features.mechanics.joint_hardware import CouplingCheck
-from dxlrun.log.log_reader import read_log
 from dxlrun.run import virtual_run
 from dxlrun.run.virtual_run import VirtualRobot
-from dxlrun_controllers.group import JointGroupPositionController
 
 pytestmark = pytest.mark.long
 
-TURN = 4096
 CROSSING = """\
 name: neck
 buses: {main: {port: sim, protocol: 2.0, baud_rate: 1_000_000, return_delay_time: 0 us}}
@@ -46,70 +43,15 @@ policies: {on_returned_servo: hold}
 """
 
 
-@pytest.fixture
-def sways(monkeypatch):
-    """All joints sway within their limits."""
-
-    def update(controller, time_ns, period_ns):
-        wave = math.sin(2 * time_ns * 1e-9)
-        controller.context.commands.position[:] = [0.3 * wave, 0.5 * wave, 0.01, 0.4 * wave, -0.2 * wave]
-
-    monkeypatch.setattr(JointGroupPositionController, "update", update)
-
-
 def written(robot, servo, *addresses):
     """Return when a servo was told to write which bytes to an address."""
     entries, (bus,) = robot.ledger.entries, robot.plan.buses
     return [(t, data) for t, one, at, data in all_writes(entries, bus) if one == servo and at in addresses]
 
 
-def goals(robot, servo, after_ns=0):
-    """Return the goal positions that a servo was sent: time and ticks; they stand last in their block."""
-    found = written(robot, servo, 112, 116)
-    return [(t, int.from_bytes(data[-4:], "little", signed=True)) for t, data in found if t > after_ns]
-
-
 def torque(robot, servo, after_ns=0, before_ns=1 << 62):
     """Return what was written to torque enable (64) of a servo in a time."""
     return [data[0] for t, data in written(robot, servo, 64) if after_ns < t < before_ns]
-
-
-def test_servos_of_one_joint_get_equal_goals_and_no_goal_leaves_the_limits(plan, sways):
-    robot = VirtualRobot(plan(duration_s=1.5))
-    robot.run()
-    first, second = dict(goals(robot, 2)), dict(goals(robot, 3))
-    assert len(first) > 40
-    for t in first.keys() & second.keys():
-        assert first[t] - TURN // 2 == -(second[t] - TURN // 2)
-    ranges = {s.servo_id: (s.lower_tick, s.upper_tick) for bus in robot.plan.buses for s in bus.servos}
-    for servo, (lower, upper) in ranges.items():
-        ticks = [tick for _, tick in goals(robot, servo)]
-        assert lower <= min(ticks) <= max(ticks) <= upper
-    # head turns by 0.3 rad, its servo by twice that; the gripper's 10 mm are 10 / 94.2 of a turn
-    head = [tick for _, tick in goals(robot, 1)]
-    assert max(head) == TURN // 2 + round(0.6 / math.tau * TURN)
-    assert goals(robot, 7)[-1][1] == TURN // 2 + round(10 / 94.2 * TURN)
-    assert robot.result is not None
-    assert robot.result.invalid == (0,) * 5
-
-
-def test_states_in_the_log_are_those_of_joints_and_no_servo_moves_at_the_start(plan, tmp_path):
-    robot = VirtualRobot(plan(), log=tmp_path / "run.mcap")
-    (bus,) = robot.buses
-    turn_by_hand(bus.servo(5), math.radians(200))
-    turn_by_hand(bus.servo(1), math.radians(200))
-    turn_by_hand(bus.servo(7), math.radians(270))
-    present = {servo.servo_id: round(servo.shaft_angle / math.tau * TURN) for servo in bus.servos}
-    robot.run()
-    for servo, tick in present.items():
-        assert {sent for _, sent in goals(robot, servo)} == {tick}
-    head, hip, gripper, *wrist = read_log(tmp_path / "run.mcap").cycles["position"][0]
-    assert (math.degrees(head), math.degrees(hip)) == (pytest.approx(10, abs=0.1), 0.0)
-    assert gripper == pytest.approx(0.0942 / 4, abs=1e-4)
-    left, right = ((present[servo] - TURN // 2) / TURN * math.tau for servo in (5, 6))
-    assert wrist == pytest.approx(
-        [(left - right) / 2, (left + right) / 2], abs=0.002
-    )  # right counts backwards
 
 
 def test_servos_that_disagree_are_refused_before_any_gets_torque(plan, monkeypatch):
@@ -154,43 +96,12 @@ def test_servos_that_begin_to_disagree_in_the_run_are_one_event_until_they_agree
     assert len(events.list) == 3
 
 
-def test_a_controller_for_one_joint_of_a_wrist_is_not_loaded_in_another_mode(plan):
-    robot = VirtualRobot(plan())
-    known = robot.plan.loop.controllers[1]
-    part = replace(known, name="part", joints=("pitch",), command=("velocity",))
-    refusal = robot.robot.manager.load_controller(part)
-    assert isinstance(refusal, Refusal)
-    assert "the mode of pitch, but not of roll" in str(refusal.fields["problem"])
-    assert robot.robot.manager.load_controller(replace(part, command=("position",))) == 2
-
-
 def test_a_wrist_outside_its_limits_is_refused_though_each_servo_is_within_its_range(plan):
     robot = VirtualRobot(plan())
     for servo, angle in ((5, 80), (6, -80)):  # pitch at 80 deg, roll at 0
         turn_by_hand(robot.buses[0].servo(servo), math.radians(180 + angle))
     with pytest.raises(StartUpError, match=r"pitch \(ID 5 and 6 on bus main\) is at 80.0 deg, outside"):
         robot.run()
-
-
-GONE_NS, BACK_NS = 500_000_000, 1_500_000_000
-
-
-def lose(robot, servo):
-    lost = robot.buses[0].servo(servo)
-    robot.buses[0].at(GONE_NS, lost.silence)
-    robot.buses[0].at(BACK_NS, lambda: lost.silence(False))
-
-
-def test_a_lost_servo_holds_its_partner_where_it_is(plan, sways):
-    robot = VirtualRobot(plan(duration_s=1.4))
-    lose(robot, 3)
-    result = robot.run()
-    held = [tick for t, tick in goals(robot, 2) if GONE_NS + 150_000_000 < t < BACK_NS - 100_000_000]
-    others = [tick for _, tick in goals(robot, 1, GONE_NS + 150_000_000)]
-    assert len(set(held)) <= 1
-    assert len(set(others)) <= 1  # all are of one controller, which waits
-    assert result.invalid[1] > 20
-    assert result.invalid[0] == 0
 
 
 def ask_torque(robot, joint, *wanted):
