@@ -99,6 +99,22 @@ def test_a_process_has_some_connections_and_leaves_those_of_others_alone(door, m
     door.open(act)
 
 
+def test_head_and_body_of_a_reply_are_sent_together(door, monkeypatch):
+    sent = []
+    transport = asyncio.selector_events._SelectorSocketTransport
+    write = transport.write
+    monkeypatch.setattr(transport, "write", lambda self, data: (sent.append(bytes(data)), write(self, data)))
+
+    async def act():
+        reader, writer = await door.connect(STOP)
+        answer = await reader.readuntil(b"}")
+        writer.close()
+        return answer
+
+    answer = door.open(act)
+    assert [data for data in sent if data not in (b"", STOP)] == [answer]
+
+
 def test_a_silent_connection_is_closed(door, monkeypatch):
     monkeypatch.setattr(server, "SILENCE_S", 0.02)
 

@@ -22,6 +22,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
 
+import h11
 import msgspec
 import uvicorn
 from msgspec.json import Decoder
@@ -51,6 +52,8 @@ others.
 """
 SILENCE_S = 30.0
 """Timeout, s, of a connection on which the client neither sends a byte nor reads the pending reply."""
+LONGEST_HEAD = 16384
+"""Upper limit of a request's line and headers, bytes."""
 
 _CREDENTIALS = struct.Struct("3i")
 
@@ -165,7 +168,6 @@ def config_of(app: ASGIApp) -> uvicorn.Config:
         # The connection's own timeout must expire first.
         timeout_keep_alive=math.ceil(SILENCE_S) + 1,
         timeout_graceful_shutdown=1,
-        h11_max_incomplete_event_size=16384,
     )
 
 
@@ -178,6 +180,26 @@ class _Server(uvicorn.Server):
         yield
 
 
+class _JoinedReplies(h11.Connection):
+    """HTTP/1.1 codec that returns the head of a reply together with the first bytes of its body.
+
+    uvicorn writes each on its own. The head alone would wake the client, which takes precedence over the
+    gateway: on a busy machine, the body would follow some milliseconds later.
+    """
+
+    _head: tuple[bytes, ...] = ()
+
+    def send_with_data_passthrough(self, event: h11.Event) -> list[bytes] | None:
+        """Return the bytes of an event that are to be written now; None for the end of the connection."""
+        data = super().send_with_data_passthrough(event)
+        if data is None:
+            return None
+        joined, self._head = (*self._head, *data), ()
+        if isinstance(event, h11.Response):
+            self._head, joined = joined, ()
+        return list(joined)
+
+
 class Connection(H11Protocol):
     """HTTP/1.1 connection of a client, which is closed after a silence or when its process has too many."""
 
@@ -188,6 +210,7 @@ class Connection(H11Protocol):
         another.
         """
         super().connection_made(transport)
+        self.conn = _JoinedReplies(h11.SERVER, LONGEST_HEAD)
         if listener := self.app_state.get("listener"):
             listener.admit(transport.get_extra_info("peername"))
         self.last_byte_s = self.loop.time()
