@@ -1,11 +1,14 @@
 """The process of simulated buses: terminals that hosts open, and lines of JSON with its starter."""
 
 import contextlib
+import ctypes
+import math
 import os
 import random
 import select
 import signal
 import socket
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,13 +18,16 @@ import pytest
 import serial
 from tests.kit.awaited import DEADLINE_S, until
 from tests.kit.bus_process import BusProcess, launch, opened, receive
+from tests.kit.packets import packet1
 
 from dxlsim.bus.ledger import Ledger, read_ledger
 from dxlsim.bus.simulated_bus import SimulatedBus
+from dxlsim.motion.plant import Floats
 from dxlsim.serving.pseudo_terminal import DeviceLink, PseudoTerminal
-from dxlsim.serving.simulation_server import lateness_us
+from dxlsim.serving.served_bus import LocalStarter
+from dxlsim.serving.simulation_server import Server, lateness_us
 from dxlsim.simulation_plan import BusConfig, ServoConfig, SimulationConfig
-from dxlsim.wire.compiled_line import line_library
+from dxlsim.wire.compiled_line import ServerState, line_library
 
 PING_1 = bytes.fromhex("ff ff 01 02 01 fb")
 PONG_1 = bytes.fromhex("ff ff 01 02 00 fc")
@@ -356,6 +362,46 @@ def test_a_sleep_begins_to_end_earlier_by_what_nearly_all_sleeps_are_late():
     assert 15_000 < early_ns < 25_000
     assert polled_ns / 10_000 < 500
     assert line_library().line_early(early_ns, 10**12) == 50_000
+
+
+def test_replies_of_several_lines_wait_for_each_other_for_50_us_at_most():
+    chance, buses = random.Random(4), [SimulatedBus(BUSES[0], Ledger(), 0) for _ in range(5)]
+    with contextlib.ExitStack() as stack:
+        terminals = [stack.enter_context(contextlib.closing(PseudoTerminal(bus))) for bus in buses]
+        addresses = (ctypes.c_void_p * 5)(*(ctypes.addressof(each.state) for each in terminals))
+        server, waited = ServerState(terminals=ctypes.addressof(addresses), count=5), []
+        for now_ns in range(10**9, 10**11, 10**9):
+            for bus in buses:
+                bus.receive_bytes(READ_1, now_ns + chance.randrange(200_000))
+            due = sorted(bus.next_due_ns() or 0 for bus in buses)
+            at_ns = line_library().line_find_delivery(ctypes.byref(server))
+            assert at_ns == max(each for each in due if each < due[0] + 50_000)
+            waited.append(at_ns - due[0])
+            for bus in buses:
+                bus.drain_bytes(now_ns + 10**8)
+    assert 0 in waited
+    assert 40_000 < max(waited) < 50_000
+
+
+def test_a_shaft_moves_to_its_goal_while_no_host_sends(tmp_path):
+    class Shafts:
+        values, angle = 3, 0.0
+
+        def write_sample(self, t_ns: int, values: Floats) -> None:
+            self.angle = values.item(0)
+
+    shafts, link = Shafts(), tmp_path / "port"
+    starter = LocalStarter(lambda message: None)
+    config = SimulationConfig((BusConfig("main", 1_000_000, PAIR[:1]),), links={"main": str(link)})
+    with contextlib.closing(starter):
+        server = Server(config, Ledger(), starter, shafts=shafts)
+        thread = threading.Thread(target=server.serve_ports, daemon=True)
+        thread.start()
+        with opened(str(link)) as port:
+            os.write(port, packet1(1, 3, 30, 0, 2))  # its goal, in the middle
+            until(lambda: abs(shafts.angle - 512 * math.radians(300) / 1023) < 0.02)
+        starter.end_server()
+        thread.join()
 
 
 def test_a_link_never_replaces_a_file_and_is_removed_only_where_it_was_put(tmp_path):

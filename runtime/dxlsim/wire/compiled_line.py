@@ -85,6 +85,7 @@ _FUNCTIONS: dict[str, tuple[type | None, tuple[object, ...]]] = {
     "execute": (None, (c_void_p, c_char_p, c_int64, c_int64)),
     "execute_altered": (None, (c_void_p, c_char_p, c_int64)),
     "feed": (c_int32, (c_void_p, c_char_p, c_int64, c_int64, c_void_p)),
+    "find_delivery": (c_int64, (c_void_p,)),
     "forget": (None, (c_void_p,)),
     "free": (None, (c_void_p,)),
     "free_ledger": (None, (c_void_p,)),

@@ -1751,7 +1751,7 @@ static int has_run_task(const Server *s)
 
 /* Return the time of the next delivery to any host, NEVER without one, or of the last one that is due shortly after it.
  * Publish the time of each line. */
-static int64_t find_delivery(const Server *s)
+int64_t line_find_delivery(const Server *s)
 {
     int64_t soonest_ns = NEVER, last_ns;
     for (int32_t i = 0; i < s->count; i++) {
@@ -1953,7 +1953,7 @@ static int64_t work_in_idle_time(Server *s, int64_t now_ns)
 int32_t line_serve(Server *s)
 {
     for (int32_t left = 0; !left;) {
-        int64_t now_ns = look_at_clock(s), due_ns = find_delivery(s), easy_ns = NEVER;
+        int64_t now_ns = look_at_clock(s), due_ns = line_find_delivery(s), easy_ns = NEVER;
         for (int32_t i = 0; i < s->count; i++)
             s->terminals[i]->bus->line.done = 0;
         if (s->ledger->most && s->ledger->entries.size && s->python_ns == NEVER)
