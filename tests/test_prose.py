@@ -73,7 +73,6 @@ def descriptions_of(call: ast.Call) -> Iterator[Text]:
 
 @lru_cache(1)
 def nodes_of(source: str) -> list[ast.AST]:
-    """Return all nodes of a Python source."""
     return [*ast.walk(ast.parse(source))]
 
 
@@ -119,7 +118,6 @@ def messages_of(source: str) -> Iterator[Text]:
 
 
 def find_phrases(text: Text) -> Iterator[str]:
-    """Yield the names of the phrases that a text has."""
     if text.kind not in {"comment", "message"} and (start := START.match(text.text)):
         yield f"begins with {start[1]}"
     plain = _CODE.sub("", " ".join(text.text.split()))
@@ -129,7 +127,6 @@ def find_phrases(text: Text) -> Iterator[str]:
 
 
 def product_files() -> list[Path]:
-    """Return the Python files of the product."""
     files = [*(ROOT / "runtime").rglob("*.py"), *(ROOT / "plugins").rglob("*.py")]
     return sorted(path for path in files if "tests" not in path.parts and ".venv" not in path.parts)
 

@@ -126,7 +126,6 @@ class Elsewhere(NamedTuple):
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A log of Linux."""
     place = tmp_path_factory.mktemp("linux")
     command = [sys.executable, "-m", "dxlrun", TORSO, "--virtual", "--duration", "1"]
     subprocess.run(command, cwd=place, capture_output=True, check=True)

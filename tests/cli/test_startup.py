@@ -81,7 +81,6 @@ def after(*lines: str) -> tuple[list[set[str]], set[str]]:
 
 
 def beneath(modules: set[str], *packages: str) -> set[str]:
-    """Return the modules that are one of these packages, or in one."""
     return {name for name in modules if any(f"{name}.".startswith(f"{each}.") for each in packages)}
 
 

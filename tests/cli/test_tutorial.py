@@ -98,7 +98,6 @@ class Reader:
 
     @property
     def log(self) -> Path | None:
-        """The newest log."""
         logs = self.place.glob("logs/*.mcap")
         return max(logs, key=lambda path: path.stat().st_mtime_ns, default=None)
 

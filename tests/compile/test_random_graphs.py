@@ -58,7 +58,6 @@ class Entry:
     active: bool = True
 
     def line(self, steps: int) -> str:
-        """Return its line in the file."""
         lists = {name: getattr(self, name) for name in ("joints", "command", "exports", "into", "reads")}
         words = [f"{key}: [{', '.join(names)}]" for key, names in lists.items() if names]
         words += [f"rate: {RATE / self.every:g}", f"active: {str(self.active).lower()}"]

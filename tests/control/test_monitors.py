@@ -50,7 +50,6 @@ class FarJoints:
         return cls(actions)
 
     def check_cycle(self, time_ns: int) -> None:
-        """Act by the time."""
         if time_ns > 0.5e9 * ENDS_S and not self.limp:
             self.limp = True
             self.actions.make_limp([0])
@@ -66,7 +65,6 @@ class Broken(FarJoints):
     error: BaseException = ValueError("no such joint")
 
     def check_cycle(self, time_ns: int) -> None:
-        """Raise by the time."""
         if time_ns > 1e9 * ENDS_S:
             raise self.error
 
@@ -83,7 +81,6 @@ class OneMonitor(Feature, frozen=True, kw_only=False):
     monitor: type[FarJoints] = FarJoints
 
     def stage(self, kind: type[S]) -> S | None:
-        """Return the monitor."""
         found = MonitorStage(self.monitor)
         return found if isinstance(found, kind) else None
 

@@ -16,7 +16,6 @@ ENTRIES = (
 
 
 def filled(path: Path | None = None, *, keep: bool = True) -> Ledger:
-    """Return a ledger with entries."""
     ledger = Ledger(path.open("wb", 1 << 16), keep=keep) if path else Ledger()
     for each in ENTRIES:
         ledger.add(each.t_ns, each.bus, each.direction, each.data, each.note)

@@ -164,7 +164,6 @@ class Bench:
         assert all(self.rig.torque())
 
     def remember(self) -> None:
-        """Remember where the joints are."""
         self.before = {joint.servo_id: joint.angle for joint in self.joints}
 
     def move(self) -> None:

@@ -39,7 +39,6 @@ class Fault(NamedTuple):
     result: str
 
     def text(self) -> str:
-        """Return the block."""
         lines = [f"{self.path}: {self.effect}"]
         lines += [f"- {line}" for line in self.old.splitlines()]
         lines += [f"+ {line}" for line in self.new.splitlines()]
@@ -47,7 +46,6 @@ class Fault(NamedTuple):
 
 
 def parsed(text: str) -> Iterator[Fault]:
-    """Yield the faults of a text."""
     for block in filter(None, map(str.strip, text.split("\n\n"))):
         head, *lines = block.splitlines()
         path, _, effect = head.partition(": ")

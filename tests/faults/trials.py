@@ -90,7 +90,6 @@ class Trial(NamedTuple):
 
 
 def trial_of(fault: Fault, covered: CoverageData) -> Trial:
-    """Return the trial of a fault."""
     right, wrong = faults.texts_of(fault)
     lines: set[int] = set()
     if is_loadable(fault.path, right, wrong):

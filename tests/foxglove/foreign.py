@@ -74,7 +74,6 @@ class ForeignViewer:
         self.socket.send(head + encoding + json.dumps(body).encode())
 
     def take(self, timeout: float = DEADLINE_S) -> None:
-        """Take one frame."""
         frame = self.socket.recv(timeout)
         if isinstance(frame, str):
             self._text(json.loads(frame))

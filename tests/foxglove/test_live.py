@@ -40,8 +40,6 @@ def run(tmp_path, monkeypatch):
 
 
 class Started(NamedTuple):
-    """A server."""
-
     url: str
     process: int
 

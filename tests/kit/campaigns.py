@@ -54,7 +54,6 @@ def campaign(*, ci: float, night: float, release: float) -> Callable[[Test], Tes
 
 
 def add_options(parser: pytest.Parser) -> None:
-    """Add the options of campaigns to pytest."""
     group = parser.getgroup("campaigns")
     levels = [level.value for level in Level]
     group.addoption("--campaign", choices=levels, default="ci", help="how long campaigns run (default: ci)")

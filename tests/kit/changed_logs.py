@@ -81,8 +81,6 @@ def add(field: str, place: int | tuple[int, int], value: float) -> Change:
 
 
 def flip(field: str, cycle: int, row: int, bit: int = 0) -> Change:
-    """Flip one bit of a number of a cycle."""
-
     def edit(cycles: Any) -> None:
         cycles[field][cycle].view(np.uint64)[row] ^= np.uint64(1 << bit)
 

@@ -30,8 +30,6 @@ class TypedCommand:
 
 @dataclass(frozen=True)
 class Run:
-    """A run that is over."""
-
     robot: VirtualRobot
     log: Log
 

@@ -15,7 +15,6 @@ NO_ARGUMENTS: Mapping[str, str] = {}
 
 
 def write(text: str | bytes, name: str = "robot.yaml") -> Path:
-    """Write a file."""
     path = Path.cwd() / name
     path.write_bytes(text.encode() if isinstance(text, str) else text)
     return path

@@ -104,7 +104,6 @@ class Dialogue:
 
 
 def servos_of(text: str) -> HandLine:
-    """Return a line with the servos of a text."""
     found = re.findall(r"(\d+) (\S+) at ([\d.]+)", text)
     servos = [ServoConfig(int(number), model, math.radians(float(at))) for number, model, at in found]
     if servos[0].model in ("AX-12A", "MX-64"):

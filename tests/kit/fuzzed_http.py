@@ -19,8 +19,6 @@ _PAGE = os.sysconf("SC_PAGE_SIZE")
 
 
 class Said(NamedTuple):
-    """A request."""
-
     method: str
     path: str
     body: bytes = b""

@@ -32,7 +32,6 @@ class HandLine(VirtualLine):
         self._faults.attach([self.bus])
 
     def open(self, path: str) -> TunablePort:
-        """Be the port that a command opens."""
         self.name = path
         return cast("TunablePort", self)
 
@@ -158,7 +157,6 @@ class LiveRobot:
             tick.wait(0.02)
 
     def inject(self, fault: str) -> None:
-        """Let a fault happen."""
         assert self._servos.stdin is not None
         self._servos.stdin.write(f"{fault}\n")
         self._servos.stdin.flush()

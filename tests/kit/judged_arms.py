@@ -167,7 +167,6 @@ def six_axis(*, more: bool = False) -> Arm:
 
 
 def arms() -> dict[str, Arm]:
-    """Return the arms by name."""
     follower = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll")
     found = [
         example("open_manipulator_x", "link1", "end_effector_link",

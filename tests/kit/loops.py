@@ -122,7 +122,6 @@ class Events:
         self.data.append(data)
 
     def data_of(self, code: EventCode) -> list[bytes]:
-        """Return the data of all events of a kind."""
         return [data for seen, data in zip(self.seen, self.data, strict=True) if seen[0] == code]
 
     def of(self, code: EventCode) -> list[tuple[str, str]]:

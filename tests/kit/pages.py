@@ -10,7 +10,6 @@ PATHS = {path.name: path for path in sorted(DOCS.rglob("*.md")) if path.parent.n
 
 
 def page_text(name: str) -> str:
-    """Return the text of a page."""
     return PATHS[name].read_text()
 
 
@@ -24,7 +23,6 @@ def page_commands(name: str, section: str = "") -> list[list[str]]:
 
 
 def page_blocks(name: str, language: str) -> list[str]:
-    """Return the blocks of a language on a page."""
     return re.findall(rf"^```{language}\n(.*?)^```$", page_text(name), re.MULTILINE | re.DOTALL)
 
 

@@ -130,7 +130,6 @@ def long_files() -> Iterator[tuple[str, str]]:
 
 
 def add_options(parser: pytest.Parser) -> None:
-    """Add the options of the selection to pytest."""
     group = parser.getgroup("selection")
     group.addoption(
         "--all", action="store_true", help="run the long tests as well, as campaigns beyond CI do"

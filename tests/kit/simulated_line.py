@@ -133,7 +133,6 @@ class Line:
 
     @property
     def faults(self) -> list[str]:
-        """The faults that have happened."""
         return [note.removeprefix("fault: ") for note in self.notes if note.startswith("fault: ")]
 
     def servo(self, servo_id: int = 1) -> SimulatedServo:

@@ -28,7 +28,6 @@ ALLOWED_BUT_FOR_ALL = {
 
 
 def add_options(parser: pytest.Parser) -> None:
-    """Add the option of skips to pytest."""
     parser.addoption(
         "--strict-skips", action="store_true", help="fail for a skip that tests/kit/skips.py does not allow"
     )

@@ -161,7 +161,6 @@ class Stage:
 
     @property
     def goal(self) -> Goal:
-        """The newest goal."""
         return self.goals[-1]
 
     def prepare(self, kind: str, **command: object) -> Any:
@@ -224,12 +223,10 @@ class Stage:
     # By cycle
 
     def ask(self, kind: str, **command: object) -> Goal:
-        """Send a goal."""
         self.send(None, kind, **command)
         return self.goal
 
     def give(self, kind: str, **command: object) -> None:
-        """Send a command."""
         self.send(None, kind, **command)
 
     def step(self, periods: float = 1.0) -> None:

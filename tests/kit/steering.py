@@ -519,7 +519,6 @@ def compile_story(text: str, folder: Path) -> Plan:
 
 
 def read_story(case: TextCase) -> Story:
-    """Return the story of a case."""
     story = Story(case.head, [])
     for line in case.lines:
         if found := re.fullmatch(r"at (\S+) s *(.*)", line.text):

@@ -19,7 +19,6 @@ Asked = Mapping[int, Sequence[CommandMessage]]
 
 
 def ask(kind: str, data: object = None) -> CommandMessage:
-    """Return a command for the loop."""
     return CommandMessage(0, "", kind, b"" if data is None else msgspec.json.encode(data), "anna")
 
 

@@ -160,7 +160,6 @@ class Story:
         self.shafts[number].append(servo.shaft_angle)
 
     def expect(self, line: str) -> None:
-        """Check a line of what is expected."""
         word, _, rest = line.partition(" ")
         if word == "goal":
             controller, status, *text = rest.split(" ", 2)

@@ -67,8 +67,6 @@ class ScanRig(ToolRig):
 
 @dataclass
 class ToolCase(Case):
-    """A case of the tool."""
-
     refused: bool | None = False
     tool: ToolRig = field(init=False)
 
@@ -147,7 +145,6 @@ class ToolCase(Case):
 
 
 def described(found: FoundServo) -> str:
-    """Return what a scan found."""
     where = f"ID {found.servo_id} at {found.baud_rate} bit/s"
     return "; ".join((f"{where}: {found.model or 'unknown'}", *found.remarks))
 

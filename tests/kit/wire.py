@@ -65,8 +65,6 @@ def stands_at(servo: ServoPlan, state: bytes) -> float:
 
 
 class Instruction(NamedTuple):
-    """An instruction of the host."""
-
     t_ns: int
     servo_id: int
     instruction: int

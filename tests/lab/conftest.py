@@ -35,7 +35,6 @@ def arm(own_rig):
 
 @pytest.fixture
 def single(own_rig):
-    """A rig of one joint."""
     return own_rig(ROBOTS / "single_joint.yaml")
 
 

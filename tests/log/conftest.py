@@ -68,7 +68,6 @@ def cycle(layout):
 
 @pytest.fixture
 def path(tmp_path):
-    """Path of `log`."""
     return tmp_path / "run.mcap"
 
 

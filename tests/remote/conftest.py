@@ -44,8 +44,6 @@ TEXTS = Path(__file__).with_name("requests")
 
 
 class Go(dxlrun.CommandModel):
-    """Where to."""
-
     positions: list[float]
 
 
@@ -325,7 +323,6 @@ class Desk:
 
     @staticmethod
     def frames(stream):
-        """Return all frames that a stream has."""
         data = stream.frames()
         while stream.behind:
             data += stream.frames()

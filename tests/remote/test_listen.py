@@ -122,7 +122,6 @@ def sent(*numbers: int, place: int = 0) -> bytes:
 
 @pytest.fixture
 def robot() -> Iterator[Callable[[Link], RemoteRobot]]:
-    """Return a client of a link."""
     used: list[Link] = []
 
     def make(link: Link) -> RemoteRobot:

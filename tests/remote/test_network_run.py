@@ -58,7 +58,6 @@ class Computers:
             self.port = free.getsockname()[1]
 
     def at(self, computer):
-        """Be at one of them from now on."""
         home = self.place / computer
         for name, folder in (("XDG_CONFIG_HOME", "settings"), ("XDG_RUNTIME_DIR", "r")):
             (home / folder).mkdir(parents=True, exist_ok=True)

@@ -43,7 +43,6 @@ class Stage:
         self.states = StandUp(self.robot).states()
 
     def until(self, state: str) -> list[str]:
-        """Return the states that follow, to this one."""
         seen = []
         while not seen or seen[-1] != state:
             seen.append(next(self.states))

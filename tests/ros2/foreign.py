@@ -130,7 +130,6 @@ class Foreign(Node):
         threading.Thread(target=repeat, daemon=True).start()
 
     def call(self, service, kind, fields):
-        """Call a service, and return its answer."""
         client = self._once(self.create_client, kind, service)
         until(client.service_is_ready, f"service {service}")
         return plain(self._ended(client.call_async(filled(type_of(kind).Request(), fields)), service))

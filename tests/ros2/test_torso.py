@@ -42,7 +42,6 @@ class Torso(NamedTuple):
         self.foreign.do("say", "/left_arm/joint_trajectory", "trajectory_msgs/msg/JointTrajectory", message)
 
     def now(self) -> dict[str, float]:
-        """Return where the joints are."""
         since = self.foreign.do("count", "states")
         newest = self.foreign.do("heard", "states", 1, since)["messages"][-1]
         return dict(zip(newest["name"], newest["position"], strict=True))

@@ -183,7 +183,6 @@ CHECKS: dict[str, Callable[..., object]] = {
 
 
 def check(case: TextCase, runs: LiveRuns, folder: Path) -> None:
-    """Run a case and judge it."""
     run, hit_ns = begin(case, runs, folder), 0
     for line in lines_after(case, "when "):
         perform(run, line)

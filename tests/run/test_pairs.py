@@ -128,7 +128,6 @@ def waited_ns(pid: int) -> int:
 
 @contextmanager
 def emulated(folder: Path) -> Iterator[Servos]:
-    """Emulate servos in a process."""
     journal = folder / "journal.jsonl"
     command = [sys.executable, str(EMULATOR), str(journal), *IDS]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:

@@ -91,7 +91,6 @@ def safe_stop(tmp_path, monkeypatch):
 
 
 def records(ring: int, kind: RecordKind) -> list[bytes]:
-    """The payloads of a kind in a ring."""
     found = iter(RingReader(ring).read_record, None)
     return [one.payload for one in found if isinstance(one, Record) and one.kind == kind]
 

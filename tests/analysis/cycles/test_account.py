@@ -44,7 +44,6 @@ def reply(servo: int, end: int, bus: int = 0) -> LoggedPacket:
 
 
 def read_alone(servo: int, at: int, late: int) -> list[LoggedPacket]:
-    """Return the read of one servo, and its reply."""
     data = bytes([255, 255, 253, 0, servo, 7, 0, 2, 132, 0, SIZE, 0, 0, 0])
     request = LoggedPacket(0, PacketKind.INSTRUCTION, servo, at * 1000, at * 1000, data)
     return [request, reply(servo, at + ALONE + late)]

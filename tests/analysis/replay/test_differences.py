@@ -146,8 +146,6 @@ def test_plan_that_the_file_no_longer_gives(pair_log, changed):
 
 
 def flip_message(index: int, at: int, bit: int = 0) -> Change:
-    """Flip a bit of a message."""
-
     def edit(found: list[tuple[int, bytes]]) -> None:
         t_ns, data = found[index][0], bytearray(found[index][1])
         data[at] ^= 1 << bit

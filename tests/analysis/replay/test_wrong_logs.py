@@ -30,8 +30,6 @@ def test_nothing_is_compared_behind_a_gap_or_a_lost_command(pair_log, changed):
 
 
 def of_controller(name: str, **other: object) -> Change:
-    """Change a controller of the plan."""
-
     def edit(content: dict[str, dict[str, list[dict[str, object]]]]) -> None:
         (mine,) = (one for one in content["loop"]["controllers"] if one["name"] == name)
         mine |= other
