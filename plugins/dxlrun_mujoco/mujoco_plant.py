@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from dxlrun import InputError
 from dxlsim import (
     JAMMED_NM,
+    CoupledJoints,
     Mechanism,
     MechanismServo,
     Motor,
@@ -32,7 +33,6 @@ from dxlsim import (
     combine_plants,
     coupled_motion,
     coupled_projection,
-    parts_without_bodies,
 )
 
 if TYPE_CHECKING:
@@ -92,7 +92,8 @@ def mujoco_plant(bodies: UrdfBodies) -> PlantMaker:
         others = [row for row in range(len(joints)) if row not in here.rows]
         parts: list[Part] = [(here.rows, MujocoBodies(text, here, joints))] if here.rows else []
         if others or not parts:
-            parts += parts_without_bodies(bodies.mechanisms, joints, others)
+            shafts = [joints[row] for row in others]
+            parts.append((others, CoupledJoints(bodies.mechanisms, shafts, others)))
         return combine_plants(joints, parts)
 
     return make_plant

@@ -7,9 +7,9 @@ from dxlsim.faults.fault import fault_help as fault_help
 from dxlsim.faults.fault import parse_fault as parse_fault
 from dxlsim.faults.script import FaultScript as FaultScript
 from dxlsim.messages import ServoLook as ServoLook
+from dxlsim.motion.coupled_joints import CoupledJoints as CoupledJoints
 from dxlsim.motion.coupled_joints import coupled_motion as coupled_motion
 from dxlsim.motion.coupled_joints import coupled_projection as coupled_projection
-from dxlsim.motion.coupled_joints import parts_without_bodies as parts_without_bodies
 from dxlsim.motion.joint_shaft import SLOPE_TICK as SLOPE_TICK
 from dxlsim.motion.joint_shaft import SLOPE_TIMES_P as SLOPE_TIMES_P
 from dxlsim.motion.mode_shaft import SAMPLING_S as SAMPLING_S

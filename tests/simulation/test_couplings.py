@@ -9,7 +9,7 @@ import pytest
 from tests.kit.bodies import ARM, MASS, PULL, ROTOR, STEP_S, Turned, bodies_of, joint, link, run, urdf
 
 from dxlrun_mujoco.mujoco_plant import mujoco_plant
-from dxlsim.motion.coupled_joints import GIVE_RAD, CoupledJoints, joints_without_bodies
+from dxlsim.motion.coupled_joints import GIVE_RAD, CoupledJoints
 from dxlsim.motion.mechanics import Mechanics, plant_of
 from dxlsim.motion.motor import Motor
 from dxlsim.motion.plant import IndependentJoints, Plant, PlantJoint, PlantMaker
@@ -47,7 +47,7 @@ def without_bodies(*mechanisms: Mechanism) -> PlantMaker:
 
 def plant(coupling: Mechanism, motor: Motor = ROTOR, angles: Sequence[float] = ()) -> CoupledJoints:
     placed = angles or [servo.reference for servo in coupling.servos]
-    return CoupledJoints(coupling, [PlantJoint(motor, NO_LOAD, angle) for angle in placed])
+    return CoupledJoints([coupling], [PlantJoint(motor, NO_LOAD, angle) for angle in placed])
 
 
 def single(load: Load, angle: float, motor: Motor = ROTOR) -> IndependentJoints:
@@ -173,7 +173,7 @@ def test_a_servo_that_counts_again_moves_nothing(coupled, later):
 def test_all_servos_of_one_simulation_move_as_if_each_coupling_were_alone():
     joints = [PlantJoint(ROTOR, NO_LOAD, angle) for angle in (0.0, 0.0, 2.0)]
     moved, one, pair = (
-        joints_without_bodies([on_one_axis()], joints),
+        CoupledJoints([on_one_axis()], joints),
         single(NO_LOAD, 2.0),
         plant(on_one_axis()),
     )

@@ -79,11 +79,10 @@ def library() -> ctypes.PyDLL:
         ("plan", c_int32, (c_void_p, c_int32)),
         ("position_tick", c_double, (c_void_p, c_double)),
         ("show", None, (c_void_p, c_int64, c_int32, c_int32)),
-        ("step_joints", None, (c_void_p, c_void_p, c_void_p, c_void_p, c_void_p, c_int64, c_double)),
+        ("step_joints", None, (*(c_void_p, c_void_p, c_int64), *(c_void_p,) * 4, c_int64, c_double)),
         ("step_to", c_int32, (c_void_p, c_int64)),
         ("take_goal", c_int32, (c_void_p, c_int64)),
         ("withdraw", None, (c_void_p, c_int64)),
-        ("stribeck", None, (c_void_p, c_void_p, c_void_p, c_int64)),
     ):
         function = getattr(found, f"motion_{name}")
         function.argtypes, function.restype = arguments, result

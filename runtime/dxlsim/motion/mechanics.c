@@ -37,6 +37,8 @@
 #define TAU 6.283185307179586
 #define FREE 1e6        /* unreachable limit, as in control_law.py */
 #define NEAR_TICKS 10   /* distance that counts as "in position"; the manual of the X series gives no value [i] */
+#define MOST_ROUNDS 30  /* of the iteration that finds the friction of a coupling */
+#define SETTLED 1e-10   /* rad/s or m/s; the iteration ends when a round changes less */
 #define IN_POSITION 1   /* bits of Moving Status (123) */
 #define ON_THE_WAY 2
 #define RECTANGULAR 0x10
@@ -68,13 +70,31 @@ typedef struct { /* one servo: its command, trajectory, controller, motor and te
     int32_t news;                       /* 1: the temperature has changed by a degree, or an overload lasts too long */
 } Servo;
 
-typedef struct { /* one shaft of IndependentJoints with its motor and load, as PlantJoint of plant.py */
+typedef struct { /* one shaft with its motor and load, as PlantJoint of plant.py */
     double inertia;                       /* kg m^2 of motor and load */
     double damping, viscous_friction;     /* Nm s/rad: of the motor with its viscous friction; the latter alone */
     double friction, load_friction;       /* Nm; Nm per Nm of torque between motor and load */
     double gravity, down, turns, steady;  /* Nm; rad where the load hangs; load turns per turn; Nm */
     double stribeck[3];                   /* Nm, rad/s, exponent; 0 Nm: none */
+    int64_t coupled;                      /* 1: a Coupling moves it */
 } Joint;
+
+typedef struct { /* servos that move joints together, in coordinates s and q: coupled_joints.py has the equation */
+    int64_t servos, joints;
+    const int64_t *index;             /* of each servo in the mechanics */
+    double *reference;                /* rad of the shaft at s = 0 */
+    const double *per_rad;            /* s per rad of the shaft */
+    const double *rows;               /* directions of friction: each servo's own, then each joint's, the matrix M */
+    const double *stiffness, *loads;  /* servos x servos: N' K N and M' J_q M */
+    const double *rotors, *own_damping, *viscous; /* of each servo */
+    const double *friction, *load_friction, *stribeck, *jammed; /* of each servo; `stribeck` at its shaft */
+    const double *gravity, *down, *steady, *joint_friction;     /* of each joint */
+    double *braking;                  /* damping of the servos for which the matrices below hold */
+    double *mass, *inverse;           /* servos x servos */
+    double *answers, *gains;          /* change of s' and of the speed along each row by an impulse along each row */
+    double *work;                     /* room for 5 * servos + 4 * (servos + joints) numbers */
+    double dt;                        /* step for which the matrices hold, s; 0: none */
+} Coupling;
 
 typedef struct { /* new goal of a servo, which takes effect later */
     int64_t t_ns, order, index;
@@ -83,7 +103,9 @@ typedef struct { /* new goal of a servo, which takes effect later */
 
 typedef struct {
     Servo *servos;
-    Joint *joints;          /* NULL: the plant is not IndependentJoints, so Python steps it */
+    Joint *joints;          /* NULL: Python steps the plant */
+    Coupling *couplings;    /* of some of the joints */
+    int64_t coupling_count;
     double *angle, *velocity; /* of the plant, rad and rad/s */
     double *before;         /* velocities before the last step */
     double *drive, *damping; /* torque of the servos for the plant: drive - damping * velocity; Nm, Nm s/rad */
@@ -217,23 +239,148 @@ static double near_standstill(const double stribeck[3], double velocity)
     return stribeck[0] * exp(-pow(fabs(velocity) / stribeck[1], stribeck[2]));
 }
 
-void motion_stribeck(const double *stribeck, const double *velocity, double *friction, int64_t count)
+static double dot(const double *a, const double *b, int64_t count, int64_t stride)
 {
+    double sum = 0.0;
     for (int64_t i = 0; i < count; i++)
-        friction[i] = near_standstill(stribeck + 3 * i, velocity[i]);
+        sum += a[i] * b[i * stride];
+    return sum;
 }
 
-/* Advance shafts that do not affect each other by `dt` s with servo torque `drive - damping * velocity`.
+/* Replace a positive definite matrix, whose `inverse` begins as the unit matrix, by Gauss-Jordan elimination. */
+static void invert(double *matrix, double *inverse, int64_t size)
+{
+    for (int64_t at = 0; at < size; at++) {
+        double pivot = matrix[at * size + at];
+        for (int64_t k = 0; k < size; k++) {
+            matrix[at * size + k] /= pivot;
+            inverse[at * size + k] /= pivot;
+        }
+        for (int64_t i = 0; i < size; i++) {
+            double by = matrix[i * size + at];
+            for (int64_t k = 0; i != at && k < size; k++) {
+                matrix[i * size + k] -= by * matrix[at * size + k];
+                inverse[i * size + k] -= by * inverse[at * size + k];
+            }
+        }
+    }
+}
+
+/* Prepare the matrices of a coupling for a damping of its servos and a step. */
+static void take_braking(Coupling *c, const double *braking, double dt)
+{
+    int64_t n = c->servos, all = n + c->joints;
+    double *stepped = c->gains; /* free until the last lines */
+    c->dt = dt;
+    for (int64_t i = 0; i < n; i++) {
+        c->braking[i] = braking[i];
+        for (int64_t k = 0; k < n; k++) {
+            int64_t at = i * n + k;
+            c->inverse[at] = i == k;
+            c->mass[at] = c->loads[at];
+            /* As of single joints: subtract half a step of damping, but keep at least half of the inertia. */
+            if (i == k)
+                c->mass[at] += most(c->rotors[i] - c->own_damping[i] * dt / 2, c->rotors[i] / 2);
+            stepped[at] = c->mass[at] + c->stiffness[at] * (dt * dt);
+            if (i == k)
+                stepped[at] += (braking[i] + c->viscous[i]) * dt;
+        }
+    }
+    invert(stepped, c->inverse, n);
+    for (int64_t i = 0; i < n; i++)
+        for (int64_t row = 0; row < all; row++)
+            c->answers[i * all + row] = dot(c->inverse + i * n, c->rows + row * n, n, 1);
+    for (int64_t row = 0; row < all; row++)
+        for (int64_t other = 0; other < all; other++)
+            c->gains[row * all + other] = dot(c->rows + row * n, c->answers + other, n, all);
+}
+
+/* Find the impulses `held` of friction along each row by iteration (projected Gauss-Seidel), given the speeds without
+ * friction and the largest impulses. */
+static void rub(const Coupling *c, double *speeds, const double *bounds, double *held)
+{
+    int64_t all = c->servos + c->joints;
+    for (int64_t row = 0; row < all; row++)
+        held[row] = 0.0;
+    for (int32_t round = 0; round < MOST_ROUNDS; round++) {
+        double change = 0.0;
+        for (int64_t row = 0; row < all; row++) {
+            const double *gains = c->gains + row * all;
+            double impulse = clamp(held[row] - speeds[row] / gains[row], bounds[row]), by = impulse - held[row];
+            if (!(bounds[row] > 0.0) || by == 0.0)
+                continue;
+            held[row] = impulse;
+            for (int64_t other = 0; other < all; other++)
+                speeds[other] += gains[other] * by;
+            change = most(change, fabs(by) * gains[row]);
+        }
+        if (change < SETTLED)
+            return;
+    }
+}
+
+/* Advance the servos of a coupling. Damping and the elasticity of brackets are implicit (backward Euler), so a step is
+ * stable at any stiffness. */
+static void step_coupling(Coupling *c, double *angle, double *velocity, const double *drive, const double *damping,
+                          double dt)
+{
+    int64_t n = c->servos, all = n + c->joints;
+    double *place = c->work, *speed = place + n, *torque = speed + n, *braking = torque + n, *pull = braking + n;
+    double *weight = pull + n, *bounds = weight + all, *speeds = bounds + all, *held = speeds + all;
+    int changed = dt != c->dt;
+    for (int64_t i = 0; i < n; i++) {
+        int64_t at = c->index[i];
+        place[i] = c->per_rad[i] * (angle[at] - c->reference[i]);
+        speed[i] = c->per_rad[i] * velocity[at];
+        torque[i] = drive[at] / c->per_rad[i];
+        braking[i] = damping[at] / (c->per_rad[i] * c->per_rad[i]);
+        changed |= braking[i] != c->braking[i];
+    }
+    for (int64_t j = 0; j < c->joints; j++) {
+        double q = dot(c->rows + (n + j) * n, place, n, 1);
+        weight[j] = c->gravity[j] * sin(q - c->down[j]) + c->steady[j];
+        bounds[n + j] = c->joint_friction[j] * dt;
+    }
+    for (int64_t i = 0; i < n; i++)
+        pull[i] = dot(weight, c->rows + n * n + i, c->joints, n) + dot(c->stiffness + i * n, place, n, 1);
+    if (changed)
+        take_braking(c, braking, dt);
+    for (int64_t i = 0; i < n; i++) {
+        double holds = c->friction[i] + c->load_friction[i] * fabs(torque[i] - braking[i] * speed[i] + pull[i]);
+        if (c->stribeck[3 * i] != 0.0)
+            holds += near_standstill(c->stribeck + 3 * i, velocity[c->index[i]]) / fabs(c->per_rad[i]);
+        bounds[i] = (holds + c->jammed[i]) * dt;
+    }
+    double *impulse = place, *free = pull; /* both are used up */
+    for (int64_t i = 0; i < n; i++)
+        impulse[i] = dot(c->mass + i * n, speed, n, 1) + dt * (torque[i] - pull[i]);
+    for (int64_t i = 0; i < n; i++)
+        free[i] = dot(c->inverse + i * n, impulse, n, 1);
+    for (int64_t row = 0; row < all; row++)
+        speeds[row] = dot(c->rows + row * n, free, n, 1);
+    rub(c, speeds, bounds, held);
+    for (int64_t i = 0; i < n; i++) {
+        int64_t at = c->index[i];
+        velocity[at] = (free[i] + dot(c->answers + i * all, held, all, 1)) / c->per_rad[i];
+        angle[at] += velocity[at] * dt;
+    }
+}
+
+/* Advance shafts by `dt` s with servo torque `drive - damping * velocity`: those that do not affect each other here.
  *
  * The velocity is updated first, with implicit damping: stable at any damping and any step. That alone would brake less
  * than the motor does, as if dt / 2 of its damping were inertia (7 % for an MX-64). Subtracting this from the inertia
  * turns the step into Crank-Nicolson's. At least half of the inertia is kept: the correction does not improve a step as
  * long as the motor's time constant. */
-void motion_step_joints(const Joint *joints, double *angle, double *velocity, const double *drive,
-                        const double *damping, int64_t count, double dt)
+void motion_step_joints(const Joint *joints, Coupling *couplings, int64_t coupling_count, double *angle,
+                        double *velocity, const double *drive, const double *damping, int64_t count, double dt)
 {
+    for (int64_t i = 0; i < coupling_count; i++)
+        step_coupling(&couplings[i], angle, velocity, drive, damping, dt);
     for (int64_t i = 0; i < count; i++) {
         const Joint *j = &joints[i];
+        if (j->coupled)
+            continue;
         double per_torque = dt / most(j->inertia - j->damping * dt / 2, j->inertia / 2);
         double pull = j->steady;
         if (j->gravity != 0.0)
@@ -430,7 +577,8 @@ int32_t motion_step_to(Mechanics *m, int64_t now_ns)
             return STEP;
         else {
             motion_drive(m);
-            motion_step_joints(m->joints, m->angle, m->velocity, m->drive, m->damping, m->count, m->step_s);
+            motion_step_joints(m->joints, m->couplings, m->coupling_count, m->angle, m->velocity, m->drive, m->damping,
+                               m->count, m->step_s);
             motion_check_rest(m);
             end_step(m, 1);
         }

@@ -16,7 +16,7 @@ import numpy as np
 
 from dxlsim.motion.compiled_mechanics import AIM, SERVO, STRUCTS, StepResult, library
 from dxlsim.motion.control_law import LIMP, ServoCommand
-from dxlsim.motion.coupled_joints import joints_without_bodies
+from dxlsim.motion.coupled_joints import CoupledJoints
 from dxlsim.motion.link_motion import Shafts
 from dxlsim.motion.motor import Motor
 from dxlsim.motion.plant import Floats, IndependentJoints, Plant, PlantJoint, PlantMaker
@@ -308,7 +308,10 @@ class Mechanics:
         self._before, self._drive, self._damping = velocity.copy(), *np.zeros((2, len(velocity)))
         self._commands, state, plant = self.servos[_COMMAND], self._state, self.plant
         state.count, state.servos = len(self.servos), self.servos.ctypes.data
-        state.joints = plant.joints.ctypes.data if isinstance(plant, IndependentJoints) else None
+        state.joints, state.coupling_count = None, 0
+        if isinstance(plant, IndependentJoints):
+            state.joints = plant.joints.ctypes.data
+            state.couplings, state.coupling_count = ctypes.addressof(plant.couplings), len(plant.couplings)
         for name, values in {
             "angle": plant.angle,
             "velocity": plant.velocity,
@@ -335,4 +338,4 @@ def plant_of(config: SimulationConfig) -> PlantMaker:
         return maker
     if all(one.is_single for one in config.mechanisms):
         return IndependentJoints
-    return partial(joints_without_bodies, config.mechanisms)
+    return partial(CoupledJoints, config.mechanisms)

@@ -6,6 +6,7 @@ that into motion. `IndependentJoints` is the plant of joints without coupling.""
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
@@ -13,7 +14,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from dxlsim.motion.compiled_mechanics import JOINT, library
+from dxlsim.motion.compiled_mechanics import JOINT, STRUCTS, library
 from dxlsim.motion.motor import Motor
 from dxlsim.motor_model import Stribeck
 from dxlsim.simulation_plan import Load
@@ -85,14 +86,17 @@ class IndependentJoints:
             row["gravity"], row["steady"], row["turns"] = load.gravity, load.steady, load.turns
             row["down"] = load.gravity_angle + joint.recounted
         self.joints["stribeck"] = stribecks(joints)
+        self.couplings = (STRUCTS["Coupling"] * 0)()
+        """Struct `Coupling` of mechanics.c for each mechanism whose servos move joints together."""
         self._free_friction = self.joints["friction"].copy()
         self._step = library().motion_step_joints
-        self._arrays = [each.ctypes.data for each in (self.joints, self.angle, self.velocity)]
 
     def step_shafts(self, drive: Floats, damping: Floats, dt_s: float) -> None:
         """Advance by `dt_s` with servo torque `drive - damping * velocity` (Nm, Nm s/rad)."""
         drive, damping = np.ascontiguousarray(drive), np.ascontiguousarray(damping)
-        self._step(*self._arrays, drive.ctypes.data, damping.ctypes.data, len(self.joints), dt_s)
+        shafts = (each.ctypes.data for each in (self.angle, self.velocity, drive, damping))
+        coupled = ctypes.addressof(self.couplings), len(self.couplings)
+        self._step(self.joints.ctypes.data, *coupled, *shafts, len(self.joints), dt_s)
 
     def jam(self, index: int, on: bool) -> None:
         """Block a shaft at its present angle, or release it."""
