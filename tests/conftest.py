@@ -168,9 +168,13 @@ def pytest_collection_finish() -> None:
 
 @pytest.fixture(scope="session", autouse=True)
 def _no_state_of_a_user(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Let controllers keep what they learn in a directory of the tests, also those of processes."""
+    """Have a directory for what controllers learn, and one for the sockets of robots; processes inherit both.
+
+    Else a test finds the robot of another worker, or of another person, that has the same name.
+    """
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
+        for name in ("STATE_HOME", "RUNTIME_DIR"):
+            patch.setenv(f"XDG_{name}", str(tmp_path_factory.mktemp(name.lower())))
         yield
 
 

@@ -223,7 +223,7 @@ def check_page(host: str, token: str) -> None:
     headers = {"X-Dxlrun-Token": token, "Content-Type": "application/json"}
 
     def ask(path: str, body: str | None = None) -> bytes:
-        with closing(http.client.HTTPConnection(host, timeout=20)) as connection:
+        with closing(http.client.HTTPConnection(host, timeout=DEADLINE_S)) as connection:
             connection.request("GET" if body is None else "POST", path, body, headers)
             answer = connection.getresponse()
             assert answer.status == 200, path

@@ -67,8 +67,12 @@ def reads_clock(node: ast.AST) -> bool:
     )
 
 
+GIVING_UP = {"communicate", "run", "check_output", "create_connection", "HTTPConnection", "HTTPSConnection"}
+"""Calls with a `timeout`."""
+
+
 def deadlines(source: str) -> list[int]:
-    """Return the lines of loops that compare a clock, and of processes that are awaited for some seconds."""
+    """Return the lines of loops that compare a clock, and of waits for a process or peer for some seconds."""
     found = []
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.While):
@@ -77,12 +81,12 @@ def deadlines(source: str) -> list[int]:
             ]
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
             given = {one.arg: one.value for one in node.keywords}
-            timeout = (
-                given.get("timeout") if node.func.attr in {"communicate", "run", "check_output"} else None
-            )
-            if node.func.attr == "wait" and re.search(r"process|child|ran\b", ast.unparse(node.func.value)):
+            timeout = given.get("timeout") if node.func.attr in GIVING_UP else None
+            place = ast.unparse(node.func.value)
+            awaited = node.func.attr == "wait" and re.search(r"process|child|ran\b", place)
+            if awaited or node.func.attr == "settimeout":
                 timeout = node.args[0] if node.args else given.get("timeout")
-            if isinstance(timeout, ast.Constant) and timeout.value is not None:
+            if isinstance(timeout, ast.Constant) and timeout.value:
                 found.append(node.lineno)
     return found
 
@@ -103,6 +107,8 @@ def test_deadlines_are_in_the_kit() -> None:
         "process.communicate(timeout=60)",
         "run.process.wait(20)",
         "subprocess.run(words, timeout=5.0)",
+        "http.client.HTTPConnection(host, timeout=20)",
+        "end.settimeout(10)",
     ],
 )
 def test_deadline_is_found(source: str) -> None:

@@ -112,7 +112,7 @@ def test_python_follows_and_cancels_a_goal(torso: Torso) -> None:
             seen.append(state)
             goal.cancel()
 
-    assert goal.wait(20.0, feedback).status == "cancelled"
+    assert goal.wait(DEADLINE_S, feedback).status == "cancelled"
     assert 0.01 < seen[-1].progress < 0.5
     assert torso.robot.goals()[-1].number == goal.number
 

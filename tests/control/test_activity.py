@@ -13,6 +13,7 @@ from contextlib import suppress
 from functools import partial
 
 import pytest
+from tests.kit.awaited import DEADLINE_S
 from tests.kit.loops import Scripted
 
 from dxlrun.channels.event_records import EventCode
@@ -100,7 +101,7 @@ def test_processes_are_for_on_configure_and_threads_of_others_are_theirs(robot):
         def act(self, step, time_ns, value):
             if step == "update":
                 go.set()
-                assert done.wait(30)
+                assert done.wait(DEADLINE_S)
 
     result = robot.add("good", Good, command=("position", "velocity")).run(2)
     other.join()

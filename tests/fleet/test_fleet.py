@@ -128,7 +128,7 @@ def test_what_an_agent_answers(tmp_path, monkeypatch):
     assert (head, last) == (f"not running; {out} ends with:", "EOFError: EOF when reading a line")
     assert out.read_text().startswith("['arm.yaml', 'port:=x']\n")
 
-    monkeypatch.setattr("dxlrun_fleet.agent._MAIN", "import time; time.sleep(20)")
+    monkeypatch.setattr("dxlrun_fleet.agent._MAIN", "import time; time.sleep(3600)")
     assert first.answer_request("POST", START + "arm", Role.ADMIN)[0] == 200
     assert out.read_text() == ""
     for starter in (first, second):

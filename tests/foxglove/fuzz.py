@@ -8,6 +8,7 @@ from contextlib import suppress
 from urllib.parse import urlsplit
 
 from tests.foxglove.foreign import ForeignViewer
+from tests.kit.awaited import DEADLINE_S
 from tests.kit.fuzzed_http import mutated
 from websockets.exceptions import ConnectionClosed
 
@@ -49,7 +50,10 @@ def knock(url: str, count: int, draw: random.Random) -> None:
     found = urlsplit(url)
     whole = f"GET /?token=x HTTP/1.1\r\nHost: {found.netloc}\r\nUpgrade: websocket\r\n\r\n".encode()
     for _ in range(count):
-        with socket.create_connection((found.hostname, found.port), timeout=60) as end, suppress(OSError):
+        with (
+            socket.create_connection((found.hostname, found.port), timeout=DEADLINE_S) as end,
+            suppress(OSError),
+        ):
             end.sendall(mutated(whole, draw) if draw.randrange(3) else whole)
             end.shutdown(socket.SHUT_WR)
             answer = b"".join(iter(lambda: end.recv(4096), b""))

@@ -9,6 +9,7 @@ from contextlib import ExitStack, suppress
 import pytest
 from tests.foxglove.foreign import ForeignViewer
 from tests.foxglove.served import PAGE
+from tests.kit.awaited import DEADLINE_S
 from websockets.exceptions import ConnectionClosed, InvalidMessage, InvalidStatus
 
 from dxlrun import InputError
@@ -71,7 +72,7 @@ def test_half_open_connections_make_room_for_a_viewer(serve, certificate, with_t
         with ForeignViewer(served.url, tls=known) as viewer, pytest.raises(ConnectionClosed):
             viewer.take()
         assert len(os.listdir("/proc/self/fd")) < before + len(many) + MOST_UNPROVED + 10
-        many[0].settimeout(30)
+        many[0].settimeout(DEADLINE_S)
         with suppress(ConnectionResetError):  # closed either way
             assert many[0].recv(1) == b""
 

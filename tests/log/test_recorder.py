@@ -186,7 +186,7 @@ def start(path, header, layout, cycle):
         }
         job_fd, span = os.memfd_create("job"), os.memfd_create("span")
         ours, theirs = socket.socketpair()
-        ours.settimeout(60)
+        ours.settimeout(DEADLINE_S)
         os.write(job_fd, msgspec.json.encode(RecorderJob(str(path), header, rings, span=span)))
         os.lseek(job_fd, 0, os.SEEK_SET)
         descriptors.extend([*rings.values(), job_fd, span])

@@ -7,6 +7,7 @@ import time
 from contextlib import suppress
 
 import pytest
+from tests.kit.awaited import DEADLINE_S
 
 from dxlrun.remote.computation import computed
 
@@ -57,7 +58,7 @@ def test_a_copy_that_is_not_needed_any_more_is_ended_and_leaves_no_process(monke
 
 def test_a_connection_that_is_closed_meanwhile_is_closed():
     ours, theirs = socket.socketpair()
-    theirs.settimeout(10)
+    theirs.settimeout(DEADLINE_S)
 
     async def hang_up():
         computing = asyncio.ensure_future(computed(brood, 60.0))

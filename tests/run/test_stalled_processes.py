@@ -59,8 +59,9 @@ def test_stopped_simulation_skips_periods_and_loses_no_joint_unless_it_stays_sto
         folder = tmp_path / name
         folder.mkdir()
         (folder / "robot.yaml").write_text(text)
-        run = start("--duration", "4", robot=folder / "robot.yaml", directory=folder)
+        run = start("--duration", "3600", robot=folder / "robot.yaml", directory=folder)
         stop_for(run, "run.simulation_process", seconds, 0.2)
+        run.signal(signal.SIGINT)
         code, out, err = run.finish()
         log = run.log()
         if seconds > 1:
@@ -76,7 +77,7 @@ def test_stopped_simulation_skips_periods_and_loses_no_joint_unless_it_stays_sto
         verdict = next(at for at, line in enumerate(lines) if ": ran for " in line)
         assert lines[verdict + 1].startswith("  The machine was too busy: "), out
         assert "for the process of the simulated servos" in lines[verdict + 1]
-        assert code == 0, (out, err)
+        assert code == 130, (out, err)
 
     cases = (("protocol 1", ROBOT, 0.3), ("protocol 2", WITH_WATCHDOG, 0.3), ("for long", ROBOT, 1.2))
     together(check, {case[0]: case for case in cases})
@@ -85,9 +86,10 @@ def test_stopped_simulation_skips_periods_and_loses_no_joint_unless_it_stays_sto
 def test_a_loop_that_was_stopped_accuses_no_servo(start: Start, tmp_path: Path) -> None:
     slow = tmp_path / "slow.yaml"
     slow.write_text(ROBOT.replace("rate: 50", "rate: 20"))
-    run = start("--duration", "3", robot=slow)
+    run = start("--duration", "3600", robot=slow)
     run.wait_until_moving()
     stop_for(run, "run.loop_process", 0.12, 0.1)  # the guardian waits for 0.25 s
+    run.signal(signal.SIGINT)
     run.finish()
     path = run.log_path()
     assert path is not None
@@ -112,7 +114,7 @@ def busy_programs(count: int) -> Iterator[None]:
 
 def test_the_log_of_a_run_that_is_killed_beside_busy_programs_lacks_its_end_only(start: Start) -> None:
     """The docs say 0.5 s. The ledger may lack its own last 0.5 s; the bound here is for a busy machine."""
-    run = start("--duration", "60")
+    run = start("--duration", "3600")
     run.wait_until_moving()
     before_ns = run.ledger()[-1].t_ns
     with busy_programs(3):  # beside them a start takes too long

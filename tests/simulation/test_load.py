@@ -7,6 +7,7 @@ import msgspec
 import numpy as np
 import pytest
 import serial
+from tests.kit.awaited import DEADLINE_S
 from tests.kit.bodies import ARM, MASS, PULL, ROTOR, STEP_S, Turned, bodies_of, joint, link, run, urdf
 from tests.kit.bus_process import BusProcess
 from tests.kit.packets import packet2
@@ -99,7 +100,10 @@ def test_the_process_of_simulated_buses_moves_bodies():
     bus = BusConfig("main", 1_000_000, (ServoConfig(1, "XM430-W350", START * TICK),), 2.0)
     config = SimulationConfig((bus,), bodies=bodies)
     read = packet2(1, 0x02, bytes.fromhex("8400 0400"))  # present position
-    with BusProcess(config) as process, serial.Serial(process.ports["main"], 1_000_000, timeout=20) as port:
+    with (
+        BusProcess(config) as process,
+        serial.Serial(process.ports["main"], 1_000_000, timeout=DEADLINE_S) as port,
+    ):
         for _ in range(20_000):  # limp, it falls within a second, however busy the machine
             port.write(read)
             position = int.from_bytes(port.read(15)[9:13], "little", signed=True)

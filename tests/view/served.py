@@ -7,6 +7,8 @@ import threading
 from contextlib import closing
 from typing import Any
 
+from tests.kit.awaited import DEADLINE_S
+
 from dxlrun.remote.network.listener import Listener
 from dxlrun_view.page_server import HEADER, Page, hosts_of, server_of
 from dxlrun_view.shown import ViewSource
@@ -34,9 +36,9 @@ class Served:
     def ask(self, path: str, content: object = None, **headers: str) -> tuple[int, bytes]:
         """Return status and answer; `headers` replace those of the page, bytes are sent as they are."""
         connection = (
-            http.client.HTTPConnection("127.0.0.1", self.port, timeout=20)
+            http.client.HTTPConnection("127.0.0.1", self.port, timeout=DEADLINE_S)
             if self.browser is None
-            else http.client.HTTPSConnection("127.0.0.1", self.port, timeout=20, context=self.browser)
+            else http.client.HTTPSConnection("127.0.0.1", self.port, timeout=DEADLINE_S, context=self.browser)
         )
         body = content if content is None or isinstance(content, bytes) else json.dumps(content)
         given = {HEADER: self.page.token} | {name.replace("_", "-"): text for name, text in headers.items()}

@@ -59,7 +59,9 @@ def test_log_is_served_until_ctrl_c(log, place, monkeypatch, host):
         if host == "[::1]" and "cannot be listened on" in said:
             pytest.skip(said)  # this system has no IPv6
         assert address, line + said
-        with closing(http.client.HTTPConnection(host.strip("[]"), int(address[1]), timeout=20)) as connection:
+        with closing(
+            http.client.HTTPConnection(host.strip("[]"), int(address[1]), timeout=DEADLINE_S)
+        ) as connection:
             connection.request("GET", "/")
             answer = connection.getresponse()
             assert answer.status == 200
