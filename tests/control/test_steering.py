@@ -2,18 +2,17 @@
 
 import numpy as np
 import pytest
-from tests.kit.loops import PERIOD_NS, Robot, Scripted, commanding, on_update, plan_of
+from tests.kit.loops import PERIOD_NS, Robot, Scripted, commanding, plan_of
 
-from dxlrun.channels.answers import Acceptance, Code
+from dxlrun.channels.answers import Code
 from dxlrun.channels.commands import LOOP
 from dxlrun.channels.cycle import Torque
 from dxlrun.channels.event_records import EventCode
 from dxlrun.control.controllers.claims import claimed_modes, start_modes
-from dxlrun.control.controllers.switching import MODE_TIMEOUT_NS
 from dxlrun.control.steering import PAUSED_CYCLE_NS
 from dxlrun.errors import PlugInError
 from dxlrun.plan.loop_plan import JointPlan
-from dxlrun.plan.policy_plan import LIMP, SLOW_SPEED, PolicyPlan
+from dxlrun.plan.policy_plan import LIMP, PolicyPlan
 from dxlwire.modes import Mode
 
 LEFT = {"type": "left", "joints": ("j0",), "command": ("position", "velocity")}
@@ -97,25 +96,6 @@ def test_fallback_of_a_limp_joint_leaves_the_fault_to_the_next_fallback_or_to_th
 # Modes
 
 
-def test_a_switch_waits_for_the_modes_of_all_its_controllers_and_gives_up_after_five_seconds(robot):
-    answers = []
-    robot.script("arm").script("left", joints=("j0",), command=("velocity",), **OFF)
-    robot.script("press", joints=("j1",), command=("effort",), **OFF).build()
-    robot.hardware.mode_cycles = iter((3, 10**6, 3, 3)).__next__
-    keep = robot.inbox.answer_command
-    robot.inbox.answer_command = lambda number, answer: (
-        answers.append((robot.record.cycle, answer)),
-        keep(number, answer),
-    )
-    robot.run(MODE_TIMEOUT_NS // PERIOD_NS + 10, {2: robot.switches(["left", "press"], ["arm"])})
-    late = "press is not activated: j1 did not enter effort mode within 5 s"
-    assert late in robot.events.texts(EventCode.COMMAND_REFUSED)
-    (first, waiting), (cycle, given_up) = answers
-    assert (first, waiting) == (2, Acceptance(("left", "press")))
-    assert (given_up.code, cycle) == (Code.MODE_NOT_ENTERED, 2 + MODE_TIMEOUT_NS // PERIOD_NS)
-    assert robot.active(cycle - 1) == []
-
-
 def test_modes_follow_from_claims_and_the_rest_of_the_joints_rests():
     joints = (JointPlan("a", -1, 1, None), JointPlan("b", -1, 1, None, continuous=True))
     claims = [
@@ -128,19 +108,6 @@ def test_modes_follow_from_claims_and_the_rest_of_the_joints_rests():
 
 
 # Pauses and rates
-
-
-def test_in_a_pause_time_stands_still_and_goals_that_moved_away_are_approached_slowly():
-    robot, wanted = Robot(joints=1), [0.1]
-    robot.script("arm", on_update(lambda context, *_: context.commands.position.fill(wanted[-1])))
-    # the slow second after the start is over
-    robot.run(76, {60: robot.asks("pause"), 65: lambda: wanted.append(-0.9), 70: robot.asks("resume")})
-    goals = [position[0] for position, _ in robot.hardware.written]
-    assert goals[59] == goals[69] == 0.1
-    assert goals[70:73] == pytest.approx([0.1 - SLOW_SPEED * 0.02 * step for step in (1, 2, 3)])
-    assert robot.steps("arm") == [*range(60), *range(70, 76)]
-    assert robot.times("arm") == [turn * PERIOD_NS for turn in range(66)]
-    assert np.isnan(robot.column("position", 0)[60:70]).all()
 
 
 def test_the_guardian_waits_longer_in_a_pause_and_as_long_as_a_slow_loop_needs(left):

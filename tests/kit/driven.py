@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
-from tests.kit.wire import all_writes
+from tests.kit.wire import values_written
 
 from dxlrun import RemoteRobot
 from dxlrun.channels.event_records import EventCode
@@ -42,11 +42,8 @@ def changes(
     kept = tuple(entries)
     found: dict[int, list[tuple[float, int]]] = {}
     for bus in plan.buses:
-        own = [entry for entry in kept if entry.bus == bus.name]
-        for t_ns, servo, begin, data in all_writes(own, bus):
-            if begin <= address and address + size <= begin + len(data):
-                value = int.from_bytes(data[address - begin :][:size], "little", signed=True)
-                known = found.setdefault(servo, [])
-                if not known or known[-1][1] != value:
-                    known.append((t_ns * 1e-9, value))
+        for t_ns, servo, value in values_written(kept, bus, address, size, signed=True):
+            known = found.setdefault(servo, [])
+            if not known or known[-1][1] != value:
+                known.append((t_ns * 1e-9, value))
     return found

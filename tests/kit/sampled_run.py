@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from msgspec.structs import replace
 from tests.kit.stories import Clients, replayed
-from tests.kit.wire import all_writes
+from tests.kit.wire import values_written
 
 from dxlrun.channels.answers import Answer, Completion
 from dxlrun.channels.commands import CommandMessage
@@ -88,9 +88,6 @@ class SampledRun:
 
     def goals(self, joint: str, address: int, size: int) -> list[tuple[float, int]]:
         """Return the values of an item that a servo of the first bus was sent: ms and signed number."""
-        servo = self.servos[joint].servo_id
-        return [
-            (t_ns / MS, int.from_bytes(data[address - first :][:size], "little", signed=size == 4))
-            for t_ns, one, first, data in all_writes(self.robot.ledger.entries, self.plan.buses[0])
-            if one == servo and first <= address <= first + len(data) - size
-        ]
+        entries, bus = self.robot.ledger.entries, self.plan.buses[0]
+        found = values_written(entries, bus, address, size, signed=size == 4)
+        return [(t_ns / MS, value) for t_ns, one, value in found if one == self.servos[joint].servo_id]

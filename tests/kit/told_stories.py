@@ -43,7 +43,7 @@ import yaml
 from tests.kit.cases import Line, TextCase, read_cases
 from tests.kit.clients import Ask, clients_of
 from tests.kit.line_faults import lose_replies, turn_by_hand
-from tests.kit.wire import all_writes
+from tests.kit.wire import values_written
 
 from dxlrun.channels.answers import Completion
 from dxlrun.channels.event_records import EventCode
@@ -202,16 +202,12 @@ class Story:
     def _written(self, number: int, name: str) -> Iterator[tuple[float, int]]:
         """Yield the values of an item that a servo was sent, by the ledger, each with its time, s."""
         for bus in self.virtual.plan.buses:
-            entries = [entry for entry in self.virtual.ledger.entries if entry.bus == bus.name]
             for servo in (one for one in bus.servos if one.servo_id == number):
                 item = find_table(servo.model, bus.protocol).items[name]
-                for t_ns, servo_id, first, data in all_writes(entries, bus):
-                    end = item.address + item.size - first
-                    if servo_id == number and first <= item.address and end <= len(data):
-                        yield (
-                            t_ns * 1e-9,
-                            int.from_bytes(data[item.address - first : end], "little", signed=item.signed),
-                        )
+                entries, place = self.virtual.ledger.entries, (item.address, item.size)
+                for t_ns, one, value in values_written(entries, bus, *place, signed=item.signed):
+                    if one == number:
+                        yield t_ns * 1e-9, value
 
     def values(self, column: str, name: str, match: re.Match[str]) -> Any:
         """Return what a line is about: values, or what it measures of them."""

@@ -156,6 +156,15 @@ def all_writes(entries: Sequence[LedgerEntry], bus: BusPlan) -> Iterator[tuple[i
                 yield sent.t_ns, each, address, data
 
 
+def values_written(
+    entries: Sequence[LedgerEntry], bus: BusPlan, address: int, size: int, *, signed: bool = False
+) -> Iterator[tuple[int, int, int]]:
+    """Return time, servo and value of all that was written into an item by its bus, also within a block."""
+    for t_ns, servo, first, data in all_writes([one for one in entries if one.bus == bus.name], bus):
+        if first <= address and address + size <= first + len(data):
+            yield t_ns, servo, int.from_bytes(data[address - first :][:size], "little", signed=signed)
+
+
 def written(sent: Sequence[Instruction], bus: BusPlan, item: Item) -> Iterator[tuple[int, ServoPlan, int]]:
     """Return when which servo got which value in an item."""
     for one in sent:

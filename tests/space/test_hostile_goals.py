@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from tests.kit.campaigns import campaign
 from tests.kit.stories import replayed
-from tests.kit.wire import all_writes
+from tests.kit.wire import values_written
 
 from dxlrun.channels.commands import LOOP, CommandMessage, QueueInbox
 from dxlrun.control.controllers.plugin_loading import load_plugins
@@ -99,10 +99,8 @@ def test_hostile_goals_are_within_the_limits_of_the_joints(
     replayed(tmp_path / "run.mcap")
     (bus,) = plan.buses
     goals: dict[int, list[tuple[int, int]]] = {}
-    for t_ns, servo, address, data in all_writes(tuple(robot.ledger.entries), bus):
-        if address <= GOAL_POSITION and address + len(data) >= GOAL_POSITION + 4:
-            value = int.from_bytes(data[GOAL_POSITION - address :][:4], "little", signed=True)
-            goals.setdefault(servo, []).append((t_ns, value))
+    for t_ns, servo, value in values_written(robot.ledger.entries, bus, GOAL_POSITION, 4, signed=True):
+        goals.setdefault(servo, []).append((t_ns, value))
     for joint, servo in zip(plan.loop.joints[:4], (11, 12, 13, 14), strict=True):
         times, ticks = np.array(goals[servo]).T  # a goal that does not change is not sent again
         cycles = np.arange(times[0], times[-1], PERIOD_S * 1e9)
