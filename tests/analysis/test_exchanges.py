@@ -16,6 +16,7 @@ from dxlrun_analysis.report import analyze_log
 from dxlrun_analysis.servos.broken_replies import BrokenReplies
 from dxlrun_analysis.servos.exchanges import Exchanges, Loss, Pairing
 from dxlrun_analysis.servos.joint_states import BINS
+from dxlrun_analysis.servos.logged_requests import heads
 from dxlrun_analysis.servos.losses import ServoLosses, narrowest
 from dxlrun_analysis.servos.other_host import OtherHosts
 from dxlwire.packets import PacketKind
@@ -394,3 +395,11 @@ def test_where_single_servos_are_in_time_it_is_not_the_adapter_that_is_late(foun
     assert "late_replies" not in found(late_us=lambda cycle, servo: 6000 * (servo == 0 and cycle % 3 == 0))
     findings = found(late_us=lambda cycle, servo: 6000 * (cycle % 3 == 0))
     assert findings["late_replies"].subject == "main"
+
+
+@pytest.mark.parametrize("before", [b"", b"\xff\xff\x05\x02\x01\xf7"])
+def test_head_of_a_short_packet_at_the_end_of_the_log_ends_with_zeros(before):
+    ping = b"\xff\xff\x04\x02\x01\xf8"
+    texts = [part for part in (before, ping) if part]
+    found = heads(columns([(ASK, 4, text, at) for at, text in enumerate(texts)]))
+    assert found.tolist() == [int.from_bytes(text[:8].ljust(8, b"\0"), "little") for text in texts]

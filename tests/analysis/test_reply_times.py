@@ -66,7 +66,8 @@ def findings(packets: Line, *, line: bool = False) -> list[Finding]:
     """Return those about the servos; `line`: and about their bus."""
     columns = replace(PacketColumns.from_packets(packets.packets), cycle=np.array(packets.cycles, np.int64))
     times = ReplyTimes(1)
-    times.add_exchanges(Pairing((BUS,)).alone(columns), Losses(JointStates([BUS.name])))
+    exchanges = Pairing((BUS,)).alone(columns)
+    times.add_exchanges(exchanges, exchanges.complete(), Losses(JointStates([BUS.name])))
     slow = list(times.servos(0, BUS, now_and_then=True))
     return [*slow, *times.line(0, BUS, [one.subject for one in slow])] if line else slow
 

@@ -264,8 +264,9 @@ def _worse(one: Windows) -> FollowingFailure | None:
 
 def _is_worse(one: Windows, at: int, before: Flags) -> bool:
     away, speed, load = (one.mean[row] for row in (AWAY, SPEED, LOAD))
-    share, worst = one.joint.share, away[before].max()
-    there = AWAY_RAD * share
+    there, worst = AWAY_RAD * one.joint.share, away[before].max()
+    if not away[at] > max(there, WORSE * worst):
+        return False
     new = one.least[WAY, at] < one.least[WAY, before].min() - there
     new |= one.most[WAY, at] > one.most[WAY, before].max() + there
     if new or not speed[at] <= _FASTER * speed[before].max():

@@ -91,23 +91,6 @@ class Visit(NamedTuple):
         return change if self.even and math.isfinite(change) else 0.0
 
 
-class _Stay(NamedTuple):
-    """Stay of a joint at one place (3 deg wide) in one direction, with median speed, error and load."""
-
-    end_s: float
-    direction: int  # 0: nearly at rest
-    speed: float
-    off: float
-    load: float
-
-    def is_like(self, later: _Stay) -> bool:
-        """Return whether a later stay is comparable with this one: same direction and similar speed."""
-        if self.direction != later.direction:
-            return False
-        slow, fast = (self.speed, later.speed) if self.speed < later.speed else (later.speed, self.speed)
-        return fast <= _FASTER * slow + _CREEPS_RAD_S
-
-
 class FollowedJoint(NamedTuple):
     """Samples of one joint, and its trajectory after the lag typical of its kind; rad of its servo."""
 
@@ -135,34 +118,36 @@ class FollowedJoint(NamedTuple):
         known = np.isfinite(self.off)
         place = np.where(known, np.floor(np.nan_to_num(self.goal) / _PLACE_RAD), 0).astype(int)
         keys = np.column_stack([known, place, direction])
-        starts = np.flatnonzero(np.any(np.diff(keys, axis=0, prepend=-1) != 0, axis=1)).tolist()
-        usual: dict[int, list[_Stay]] = defaultdict(list)
-        times, bends = self.at_s.tolist(), self._bends()
-        values = [each.tolist() for each in (np.abs(speed), self.off, self._load_at_rest())]
-        for begin, end in zip(starts, [*starts[1:], len(keys)], strict=True):
-            if not known[begin]:
+        starts = np.flatnonzero(np.any(np.diff(keys, axis=0, prepend=-1) != 0, axis=1))
+        lengths = np.diff(starts, append=len(keys))
+        stay = np.repeat(np.arange(len(starts)), lengths)
+        speeds, offs, loads = (
+            each[np.lexsort((each, stay))[starts + lengths // 2]].tolist()
+            for each in (np.abs(speed), self.off, self._load_at_rest())
+        )
+        begins, ends = self.at_s[starts].tolist(), self.at_s[starts + lengths - 1].tolist()
+        uneven = np.logical_or.reduceat(self._bends(), starts).tolist()
+        # Stays by place and direction: end (s), speed, highest similar speed, error and load.
+        usual: dict[tuple[int, int], list[tuple[float, float, float, float, float]]] = defaultdict(list)
+        stays = zip(place[starts].tolist(), direction[starts].tolist(), strict=True)
+        for row, ((here, way), is_known) in enumerate(zip(stays, known[starts].tolist(), strict=True)):
+            if not is_known:
                 continue
-            here, at_s = int(place[begin]), times[begin]
-            middles = (sorted(each[begin:end])[(end - begin) // 2] for each in values)
-            stay = _Stay(times[end - 1], int(direction[begin]), *middles)
+            at_s, end_s, quick, off, load = begins[row], ends[row], speeds[row], offs[row], loads[row]
+            quickest = _FASTER * quick + _CREEPS_RAD_S
             before = [
-                one
+                (one_off, one_load)
                 for near in (here - 1, here, here + 1)
-                for one in usual[near]
-                if one.end_s < at_s - _AGAIN_S and one.is_like(stay)
+                for until_s, one, its_quickest, one_off, one_load in usual[near, way]
+                if until_s < at_s - _AGAIN_S and one <= quickest and quick <= its_quickest
             ]
-            was = _nearest(stay.off, [one.off for one in before])
-            took = _nearest(stay.load, [one.load for one in before if math.isfinite(one.load)])
-            if (
-                len(before) < _MOST_BEFORE
-                and abs(stay.off - was) < least
-                and not abs(stay.load - took) >= least_load
-            ):
-                usual[here].append(stay)
+            was = _nearest(off, [each for each, _ in before])
+            took = _nearest(load, [each for _, each in before if math.isfinite(each)])
+            if len(before) < _MOST_BEFORE and abs(off - was) < least and not abs(load - took) >= least_load:
+                usual[here, way].append((end_s, quick, quickest, off, load))
             if before:
-                seconds, middle = stay.end_s - at_s + self.step_s, (here + 0.5) * _PLACE_RAD
-                even = not bends[begin:end].any()
-                yield Visit(at_s, seconds, middle, stay.off, was, stay.load, took, even, stay.direction)
+                seconds, middle = end_s - at_s + self.step_s, (here + 0.5) * _PLACE_RAD
+                yield Visit(at_s, seconds, middle, off, was, load, took, not uneven[row], way)
 
     def _load_at_rest(self) -> Floats:
         """Return the load of each sample without the part that is proportional to speed."""
@@ -319,14 +304,15 @@ class _FollowingEvidence(NamedTuple):
     one: FollowedJoint
     visits: list[Visit]
     swings: Floats
+    off: float
+    load: float
 
-    @property
-    def off(self) -> float:
-        return max((visit.change for visit in self.visits), default=0.0)
-
-    @property
-    def load(self) -> float:
-        return max((visit.load_change for visit in self.visits), default=0.0)
+    @classmethod
+    def of_joint(cls, one: FollowedJoint) -> _FollowingEvidence:
+        """Collect the evidence about a joint."""
+        visits = list(one.visits(_OFF_RAD / 2, _LOAD / 2))
+        off = max((visit.change for visit in visits), default=0.0)
+        return cls(one, visits, one.swings(), off, max((visit.load_change for visit in visits), default=0.0))
 
 
 def changed(joints: Sequence[FollowedJoint], named: Set[int]) -> Iterator[Finding]:
@@ -336,11 +322,7 @@ def changed(joints: Sequence[FollowedJoint], named: Set[int]) -> Iterator[Findin
         joints: The joints that moved.
         named: Rows of joints that other rules report; they are omitted.
     """
-    seen = [
-        _FollowingEvidence(one, list(one.visits(_OFF_RAD / 2, _LOAD / 2)), one.swings())
-        for one in joints
-        if one.row not in named
-    ]
+    seen = [_FollowingEvidence.of_joint(one) for one in joints if one.row not in named]
     for mine in seen:
         others = [each for each in seen if each is not mine]
         found = _swings(mine, others) or _follows_worse(mine, others)

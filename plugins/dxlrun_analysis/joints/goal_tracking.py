@@ -312,12 +312,12 @@ class TrackingCollector:
         if not self._parts:
             return
         known = 0 if self._held is None else len(self._held)
-        cycles = np.concatenate(self._parts if self._held is None else [self._held, *self._parts])
+        parts = self._parts if self._held is None else [self._held, *self._parts]
         self._parts, self._count = [], 0
-        columns = JointColumns(cycles)
+        columns = JointColumns(*parts)
         ways = [row.track_cycles(columns, known) for row in self._rows]
-        self.movement.add_cycles(columns, np.array(ways).reshape(len(ways), len(cycles)), known)
-        self._held = cycles[-2:].copy()
+        self.movement.add_cycles(columns, np.array(ways).reshape(len(ways), len(columns)), known)
+        self._held = np.concatenate([part[-2:] for part in parts[-2:]])[-2:]
 
 
 @dataclass(slots=True)

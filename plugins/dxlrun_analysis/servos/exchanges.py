@@ -23,7 +23,6 @@ from dxlwire import BROADCAST_ID, PacketKind
 
 _ROWS = 40  # Low bits of a key hold the index of the exchange; the bits above hold the servo
 _BYTE_NS = 10_000_000_000  # Wire time of a byte times the rate in bit/s: ten bits a byte
-_HEAD_2 = 8  # Bytes before error, ID and data of the blocks of a fast status packet
 _LATEST_NS = 100_000_000  # A block of a fast status packet that comes later is treated as noise
 
 
@@ -54,6 +53,15 @@ class Exchanges(NamedTuple):
     echoes: Numbers  # Bus of each own instruction that was echoed
     unasked: Numbers  # Servo of each intact reply that no instruction of this host requests
     stray: PacketColumns  # Bytes that belong to no intact packet
+
+    def complete(self) -> tuple[Numbers, Numbers]:
+        """Return the rows of the exchanges that all servos answered, and the time of their last reply beyond
+        wire time and return delay, ns."""
+        answers, asked = np.flatnonzero(self.replies.answers), self.requests.servos[self.request]
+        of, last = self.replies.exchange[answers], np.zeros(len(self.request), np.int64)
+        last[of] = answers
+        rows = np.flatnonzero((np.bincount(of, minlength=len(asked)) == asked) & (asked > 0))
+        return rows, self.replies.last_ns[last[rows]] - self.replies.due_ns[last[rows]]
 
 
 class Replies(NamedTuple):
@@ -143,15 +151,16 @@ class Pairing:
         newest_ns = int(log.packets.first_ns[-1])
         if newest_ns - int(self._waiting[0].first_ns[0]) <= 2 * DISORDER_NS:
             return None
-        packets = ordered(PacketColumns.joined(self._waiting))
-        certain = packets.first_ns < newest_ns - DISORDER_NS
+        packets = PacketColumns.joined(self._waiting)
+        order = _order(packets)
+        bus, certain = packets.bus[order], packets.first_ns[order] < newest_ns - DISORDER_NS
         # Hold back the last instruction of each bus: its replies can still come.
-        instructions = np.flatnonzero(certain & (packets.kind == PacketKind.INSTRUCTION))
+        instructions = np.flatnonzero(certain & (packets.kind[order] == PacketKind.INSTRUCTION))
         last = np.full(IDS, len(packets), np.int64)
-        last[packets.bus[instructions]] = instructions
-        certain &= np.arange(len(packets)) < last[packets.bus]
-        self._waiting = [packets.select_rows(~certain).compact()]
-        return self._paired(packets.select_rows(certain))
+        last[bus[instructions]] = instructions
+        certain &= np.arange(len(packets)) < last[bus]
+        self._waiting = [packets.select_rows(order[~certain]).compact()]
+        return self._paired(packets.select_rows(order[certain]))
 
     def pair_remaining(self) -> Exchanges | None:
         """Return the exchanges of the packets that were held back, or None; no more slices follow."""
@@ -181,7 +190,7 @@ class Pairing:
         delays = np.array([one.return_delay_ns for one in self.buses], np.int64)[bus]
         wire_ns = np.where(rates > 0, packets.length * _BYTE_NS // np.maximum(rates, 1), 0)
         request, asked_ns, blocked_ns, sent_ns, cycle = (np.zeros(size, np.int64) for _ in range(5))
-        request[at] = self._requests.request_indices(packets.select_rows(rows))
+        request[at], code = self._requests.request_indices(packets.select_rows(rows))
         asked_ns[at] = packets.first_ns[rows]
         took_ns = packets.last_ns[rows] - packets.first_ns[rows]
         blocked_ns[at] = np.where(rates[rows] > 0, np.maximum(took_ns - wire_ns[rows], 0), 0)
@@ -207,12 +216,7 @@ class Pairing:
         to = np.full(size, -1, np.int64)
         to[at] = packets.servo_id[rows]
         # Any servo may answer a broadcast ping.
-        to[
-            at[
-                (to[at] == BROADCAST_ID)
-                & (logged_requests.instruction_of(packets.select_rows(rows)) == logged_requests.PING)
-            ]
-        ] = -1
+        to[at[(code == logged_requests.PING) & (to[at] == BROADCAST_ID)]] = -1
         others = np.flatnonzero(kind == PacketKind.OTHER_HOST)
         back = _came_back(packets, others, rows, exchange - bus)
         return Exchanges(
@@ -259,20 +263,22 @@ class Pairing:
         before_ns = np.empty(len(of), np.int64)
         before_ns[1:] = last_ns[:-1]
         before_ns[begins] = sent_ns[of[begins]]
-        second = logged_requests.second_of(status)
-        joint = second & (status.servo_id == BROADCAST_ID)
-        row = np.flatnonzero(~joint)
+        second = logged_requests.second_of(logged_requests.heads(status))
+        joint, table, asked = second & (status.servo_id == BROADCAST_ID), self._requests.all, request[of]
+        blocks, count = np.flatnonzero(joint), np.ones(len(of), np.int64)
+        # A truncated packet of several servos still has intact blocks.
+        count[blocks] = (table.block_ends[asked[blocks]] <= status.length[blocks, None]).sum(axis=1)
+        row, begin = np.repeat(np.arange(len(of)), count), np.cumsum(count) - count
         servo_id, error = status.servo_id[row], np.where(second, status.byte(8), status.byte(4))[row]
-        if joint.any():
-            pieces = [(row, np.zeros(len(row), np.int64), servo_id, error)]
-            pieces += self._blocks(status, np.flatnonzero(joint), request[of])
-            row, number, servo_id, error = (np.concatenate(column) for column in zip(*pieces, strict=True))
-            order = np.argsort(row * IDS + number, kind="stable")
-            row, servo_id, error = row[order], servo_id[order], error[order]
-        place = self._requests.all.places[request[of[row]], servo_id]
+        blocks = np.flatnonzero(joint[row])
+        of_block = row[blocks]
+        at = status.start[of_block] + table.blocks[asked[of_block], blocks - begin[of_block]]
+        servo_id[blocks], error[blocks] = status.data[at + 1], status.data[at]
+        place = table.places[asked[row], servo_id]
+        in_time = ~late[rows]
         return Replies(
             of[row],
-            status.bus[row].astype(np.int64) * IDS + servo_id,
+            status.bus.astype(np.int64)[row] * IDS + servo_id,
             place,
             error.astype(np.int64),
             np.where(second, 2, 1)[row],
@@ -280,33 +286,15 @@ class Pairing:
             last_ns[row],
             before_ns[row],
             due_ns[row],
-            (place >= 0) & ~late[rows[row]],
-            (place < 0) & ~late[rows[row]] & ~joint[row],
+            (place >= 0) & in_time[row],
+            (place < 0) & (in_time & ~joint)[row],
         )
-
-    def _blocks(
-        self, status: PacketColumns, rows: Numbers, request: Numbers
-    ) -> list[tuple[Numbers, Numbers, NDArray[np.uint8], NDArray[np.uint8]]]:
-        """Split fast status packets (`rows` of `status`) into the replies of single servos: row, number of
-        the block, ID, error byte."""
-        pieces = []
-        for index in np.unique(request[rows]).tolist():
-            mine = rows[request[rows] == index]
-            packets = status.select_rows(mine)
-            at = _HEAD_2
-            # A block consists of error, ID, data and CRC.
-            for number, size in enumerate(self._requests.all.kinds[index].sizes):
-                there = at + size + 4 <= packets.length  # A truncated packet still has intact blocks
-                numbers = np.full(int(there.sum()), number, np.int64)
-                pieces.append((mine[there], numbers, packets.byte(at + 1)[there], packets.byte(at)[there]))
-                at += size + 4
-        return pieces
 
     def _due(self, bus: Numbers, request: Numbers, replies: Replies, noise: Numbers) -> DueReplies:
         count = self._requests.all.servos[request]
         exchange, begin = np.repeat(np.arange(len(request)), count), np.cumsum(count) - count
-        place = np.arange(len(exchange)) - begin[exchange]
-        servo_id = self._requests.all.ids[request[exchange], place - count[exchange]]
+        place = np.arange(len(exchange)) - np.repeat(begin, count)
+        servo_id = self._requests.all.ids[np.repeat(self._requests.all.begins[request], count) + place]
         reply = np.full(len(exchange), -1, np.int64)
         # Reversed, so that the first of several replies of a servo counts.
         rows = np.flatnonzero(replies.answers)[::-1]
@@ -319,7 +307,7 @@ class Pairing:
         silent = (np.bincount(exchange[missing], minlength=len(request)) == count) & (count > 1)
         loss[silent[exchange]] = Loss.LINE
         broken = (loss == Loss.OWN) & (noise[exchange] > 0)
-        return DueReplies(exchange, bus[exchange] * IDS + servo_id, place, reply, loss, broken)
+        return DueReplies(exchange, np.repeat(bus * IDS, count) + servo_id, place, reply, loss, broken)
 
     def _late_blocks(
         self, noise: PacketColumns, exchange: Numbers, request: Numbers, asked_ns: Numbers, due: DueReplies
@@ -351,6 +339,8 @@ def _unasked(replies: Replies, due: DueReplies, to: Numbers) -> Numbers:
     """
     rows = np.flatnonzero(replies.strange)
     exchange, servo = replies.exchange[rows], replies.servo[rows]
+    if not len(rows):
+        return servo
     asked = np.append((due.servo << _ROWS) + due.exchange, -1)
     order = np.argsort(asked)
     last = order[np.searchsorted(asked[order], (servo << _ROWS) + exchange, side="right") - 1]
@@ -421,8 +411,12 @@ def _free_ns(first_ns: Numbers, wire_ns: Numbers, free_ns: np.int64) -> Numbers:
 
 def ordered(packets: PacketColumns) -> PacketColumns:
     """Return the packets sorted by bus, then by time. Packets with equal times keep their order."""
+    return packets.select_rows(_order(packets))
+
+
+def _order(packets: PacketColumns) -> Numbers:
     order = np.argsort(packets.bus, kind="stable")
     bus, first_ns = packets.bus[order], packets.first_ns[order]
-    if ((np.diff(first_ns) < 0) & (np.diff(bus) == 0)).any():
+    if ((first_ns[1:] < first_ns[:-1]) & (bus[1:] == bus[:-1])).any():
         order = np.lexsort((packets.first_ns, packets.bus))
-    return packets.select_rows(order)
+    return order

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,8 +30,8 @@ class Places:
 
     cycle: Numbers = field(default_factory=lambda: np.zeros(0, np.int64))
     """Numbers of the cycles, ascending; shape (cycles,)."""
-    bins: Numbers = field(default_factory=lambda: np.zeros((0, len(QUANTITIES), 0), np.int64))
-    """Bin of each quantity; -1 if unknown or offline; shape (cycles, quantities, joints)."""
+    bins: NDArray[np.int16] = field(default_factory=lambda: np.zeros((len(QUANTITIES), 0, 0), np.int16))
+    """Bin of each quantity; -1 if unknown or offline; shape (quantities, joints, cycles)."""
 
 
 class JointStates:
@@ -63,10 +64,12 @@ class JointStates:
         cycles = log.cycles
         if not len(cycles):
             return
-        angle = np.where(cycles["valid"], cycles["position"] / self.share, np.nan)
-        usable = ~np.isin(cycles["torque"], OFFLINE)
-        columns = (cycles["cycle"].copy(), cycles["period_ns"].copy(), angle, usable)
-        self._held.append((*columns, cycles["temperature"].copy()))
+        # Joint by joint in memory, so that each is read without gaps.
+        angle, heat = (np.array(cycles[name].T, order="C") for name in ("position", "temperature"))
+        angle /= self.share[:, None]
+        angle[~cycles["valid"].T] = np.nan
+        usable = ~np.isin(cycles["torque"].T, OFFLINE)
+        self._held.append((cycles["cycle"].copy(), cycles["period_ns"].copy(), angle, usable, heat))
         while len(self._held) > 1 and sum(len(part[0]) for part in self._held) > _MOST_HELD:
             self._held.pop(0)
 
@@ -76,22 +79,29 @@ class JointStates:
         if not self._held:
             return Places()
         numbers, period_ns, angle, usable, heat = (
-            np.concatenate(part) for part in zip(*self._held, strict=True)
+            np.concatenate(part, axis=-1) for part in zip(*self._held, strict=True)
         )
         end = len(numbers) if everything else int(np.searchsorted(numbers, cycle, side="right"))
-        for row in range(len(self.share)):
-            known = np.isfinite(angle[:, row])
+        for row, mine in enumerate(angle):
+            known = np.isfinite(mine)
             if known.any() and not known.all():
-                angle[:, row] = np.interp(numbers, numbers[known], angle[known, row])
-        self._held = [(numbers[end:], period_ns[end:], angle[end:], usable[end:], heat[end:])]
-        found = np.stack([angle, _speeds(numbers, period_ns, angle), heat], axis=1)[:end]
-        known = np.isfinite(found) & usable[:end, None]
-        steps = np.floor(np.where(known, found, 0.0) / _STEPS[:, None]).astype(np.int64)
-        bins = np.where(known, np.clip(steps - _FIRST[:, None], 0, BINS - 1), -1)
-        joints, _, count = shape = (*self.time_ns.shape[:2], BINS + 1)  # Bin -1 is counted, too, and dropped
-        first = (np.arange(len(QUANTITIES))[:, None] + len(QUANTITIES) * np.arange(joints)) * count + 1
-        spent = np.bincount((bins + first).ravel(), np.repeat(period_ns[:end], first.size), math.prod(shape))
-        self.time_ns += spent.astype(np.int64).reshape(shape)[:, :, 1:]
+                angle[row] = np.interp(numbers, numbers[known], mine[known])
+        self._held = [(numbers[end:], period_ns[end:], angle[:, end:], usable[:, end:], heat[:, end:])]
+        speeds, joints = _speeds(numbers, period_ns, angle), len(angle)
+        rows = len(QUANTITIES) * joints
+        bins = np.empty((len(QUANTITIES), joints, end), np.int16)
+        for quantity, values in enumerate((angle[:, :end], speeds[:, :end], heat[:, :end])):
+            known = np.isfinite(values) & usable[:, :end]
+            steps = np.floor(values / _STEPS[quantity])
+            steps -= _FIRST[quantity]
+            bins[quantity] = np.where(known, np.clip(steps, 0, BINS - 1, out=steps), -1)
+        # Bin -1 is counted, too, and dropped.
+        index = bins + ((BINS + 1) * np.arange(rows) + 1).reshape(len(QUANTITIES), joints, 1)
+        changes = np.flatnonzero(np.diff(period_ns[:end], prepend=-1)).tolist()
+        for begin, until in pairwise([*changes, end]):
+            cycles = np.bincount(index[..., begin:until].ravel(), minlength=rows * (BINS + 1))
+            cycles = cycles.reshape(len(QUANTITIES), joints, BINS + 1)[..., 1:]
+            self.time_ns += cycles.swapaxes(0, 1) * period_ns[begin]
         return Places(numbers[:end], bins)
 
     def range_text(self, joint: int, quantity: int, low: int, high: int) -> str:
@@ -108,9 +118,9 @@ class JointStates:
 
 def _speeds(numbers: Numbers, period_ns: Numbers, angle: Floats) -> Floats:
     """Return the speed of each joint in each cycle, from its angles in the two neighbouring cycles, rad/s,
-    shape (cycles, joints)."""
+    shape (joints, cycles)."""
     found = np.full(angle.shape, np.nan)
     if len(numbers) > 2:
         took_s = np.maximum((numbers[2:] - numbers[:-2]) * period_ns[1:-1] * 1e-9, 1e-9)
-        found[1:-1] = np.abs(angle[2:] - angle[:-2]) / took_s[:, None]
+        found[:, 1:-1] = np.abs(angle[:, 2:] - angle[:, :-2]) / took_s
     return found

@@ -15,15 +15,19 @@ from dxlwire import BROADCAST_ID
 
 IDS = 256  # Servos are numbered by index of the bus times this, plus ID
 _HEADER_2 = b"\xff\xff\xfd\x00"
+_HEADER_2_NUMBER = int.from_bytes(_HEADER_2, "little")
 _STUFFED, _PLAIN = b"\xff\xff\xfd\xfd", b"\xff\xff\xfd"
 PING, _READ = 0x01, 0x02  # Instruction codes of both protocols
 _SYNC_READ, _FAST_SYNC_READ, _BULK_READ, _FAST_BULK_READ = 0x82, 0x8A, 0x92, 0x9A
 _FAST = (_FAST_SYNC_READ, _FAST_BULK_READ)
-_MIXED = np.random.default_rng(15).integers(1, 2**63, 1 << 17, dtype=np.uint64) | np.uint64(1)
-"""Odd weights of a multilinear hash (Dietzfelbinger 1996): collisions are improbable."""
+_HEAD_2 = 8  # Bytes before error, ID and data of the blocks of a fast status packet
+_BEYOND = 1 << 17  # Longer than any packet
+_WORD = 8  # Bytes that are compared at once
+_KEPT = np.array([(1 << 8 * count) - 1 for count in range(_WORD + 1)], np.uint64)
 
 Numbers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
+Words = NDArray[np.uint64]
 
 
 class LoggedRequest(NamedTuple):
@@ -45,20 +49,35 @@ class DistinctRequests(NamedTuple):
     fast: Flags = np.zeros(0, np.bool_)
     places: Numbers = np.zeros((0, IDS), np.int64)
     """Place of each ID in the chain of replies; -1: not asked; shape (requests, 256)."""
-    ids: Numbers = np.zeros((0, IDS), np.int64)
-    """All IDs; the last `servos` of them are asked, in the order of their replies; shape (requests, 256)."""
+    ids: Numbers = np.zeros(0, np.int64)
+    """IDs that all requests ask, request by request, in the order of their replies."""
+    begins: Numbers = np.zeros(0, np.int64)  # Index in `ids` of the first servo that each request asks
+    blocks: Numbers = np.zeros((0, 0), np.int64)
+    """Offset of each block in the common status packet of a fast read, shape (requests, blocks)."""
+    block_ends: Numbers = np.zeros((0, 0), np.int64)
+    """Offset of the first byte after each block, beyond any packet if there is no such block."""
 
     def and_more(self, kinds: tuple[LoggedRequest, ...]) -> DistinctRequests:
         """Return a copy of the table with requests appended."""
+        all_kinds = (*self.kinds, *kinds)
         places = np.full((len(kinds), IDS), -1, np.int64)
         for row, one in zip(places, kinds, strict=True):
             row[list(one.servo_ids)] = np.arange(len(one.servo_ids))
+        servos = np.array([len(one.servo_ids) for one in all_kinds])
+        # A block consists of error, ID, data and CRC.
+        sizes = np.full((len(all_kinds), max(len(one.sizes) for one in all_kinds)), _BEYOND)
+        for row, one in zip(sizes, all_kinds, strict=True):
+            row[: len(one.sizes)] = np.array(one.sizes, np.int64) + 4
+        ends = _HEAD_2 + np.cumsum(sizes, axis=1)
         return DistinctRequests(
-            (*self.kinds, *kinds),
-            np.append(self.servos, [len(one.servo_ids) for one in kinds]),
-            np.append(self.fast, [one.fast for one in kinds]),
+            all_kinds,
+            servos,
+            np.array([one.fast for one in all_kinds]),
             np.concatenate([self.places, places]),
-            np.concatenate([self.ids, np.argsort(places, axis=1, kind="stable")]),
+            np.array([servo_id for one in all_kinds for servo_id in one.servo_ids], np.int64),
+            np.cumsum(servos) - servos,
+            ends - sizes,
+            ends,
         )
 
 
@@ -74,43 +93,63 @@ class RequestTable:
         self.all = _ALONE
         self._known: dict[bytes, int] = {}
 
-    def request_indices(self, packets: PacketColumns) -> Numbers:
-        """Return the row of `all` for each instruction packet; add new requests to the table."""
-        second, code = second_of(packets), instruction_of(packets)
-        servo_id = np.where(second, packets.byte(4), packets.byte(2)).astype(np.int64)
-        found = np.zeros(len(packets), np.int64)
-        single = np.isin(code, (PING, _READ)) & (servo_id != BROADCAST_ID)
-        found[single] = servo_id[single] + 1
-        many = np.where(second, np.isin(code, (_SYNC_READ, _BULK_READ, *_FAST)), code == _BULK_READ)
+    def request_indices(self, packets: PacketColumns) -> tuple[Numbers, Numbers]:
+        """Return the row of `all` and the instruction code of each instruction packet; add new requests."""
+        head = heads(packets)
+        second, code = second_of(head), instruction_of(head)
+        servo_id = np.where(second, head >> np.uint64(32), head >> np.uint64(16)).astype(np.uint8)
+        single = ((code == PING) | (code == _READ)) & (servo_id != BROADCAST_ID)
+        found = np.where(single, servo_id.astype(np.int64) + 1, 0)
+        many = np.isin(code, (_SYNC_READ, *_FAST)) & second | (code == _BULK_READ)
         for length in np.unique(packets.length[many]).tolist():
             rows = np.flatnonzero(many & (packets.length == length))
-            text = packets.data[packets.start[rows][:, None] + np.arange(length)]
-            mixed = text.astype(np.uint64) @ _MIXED[:length]
-            _, first, inverse = np.unique(mixed, return_index=True, return_inverse=True)
-            index = [
-                self._known.setdefault(text[row].tobytes(), len(_ALONE.kinds) + len(self._known))
-                for row in first.tolist()
-            ]
-            found[rows] = np.array(index)[inverse]
+            found[rows] = self._rows_of(packets.data, packets.start[rows], length)
         new = tuple(self._known)[len(self.all.kinds) - len(_ALONE.kinds) :]
         if new:
             self.all = self.all.and_more(tuple(map(request_of, new)))
+        return found, code
+
+    def _rows_of(self, data: NDArray[np.uint8], start: Numbers, length: int) -> Numbers:
+        """Return the row of each request in `data`, all of one length; note new ones in `_known`."""
+        words = [_words(data, start + at, length - at) for at in range(0, length, _WORD)]
+        found, left = np.zeros(len(start), np.int64), np.arange(len(start))
+        # A log has few distinct reads of several servos, so this takes few passes.
+        while len(left):
+            begin = start[left[0]]
+            same = np.logical_and.reduce([word[left] == word[left[0]] for word in words])
+            text = data[begin : begin + length].tobytes()
+            found[left[same]] = self._known.setdefault(text, len(_ALONE.kinds) + len(self._known))
+            left = left[~same]
         return found
 
 
-def instruction_of(packets: PacketColumns) -> Numbers:
-    """Return the instruction code of each packet, such as 0x02 for Read."""
-    return np.where(second_of(packets), packets.byte(7), packets.byte(4)).astype(np.int64)
+def heads(packets: PacketColumns) -> Words:
+    """Return the first eight bytes of each packet as a little-endian number; bytes after its end are 0."""
+    return _words(packets.data, packets.start, packets.length)
 
 
-def second_of(packets: PacketColumns) -> Flags:
-    """Return which packets have the Protocol 2.0 header.
+def _words(data: NDArray[np.uint8], start: Numbers, length: Numbers | int) -> Words:
+    """Return eight bytes from each index `start`, or `length` bytes and zeros if that is less."""
+    data = data if len(data) >= _WORD else np.append(data, np.zeros(_WORD, np.uint8))
+    # The last packets of `data` begin less than eight bytes before its end.
+    at = np.minimum(start, len(data) - _WORD)
+    words = np.ndarray((len(data) - _WORD + 1,), "<u8", data, 0, (1,))[at]
+    words >>= (8 * (start - at)).astype(np.uint64)
+    return words & _KEPT[np.minimum(length, _WORD)]
+
+
+def instruction_of(head: NDArray[np.uint64]) -> Numbers:
+    """Return the instruction code of packets with these heads, such as 0x02 for Read."""
+    code = np.where(second_of(head), head >> np.uint64(56), head >> np.uint64(32))
+    return code.astype(np.uint8).astype(np.int64)
+
+
+def second_of(head: NDArray[np.uint64]) -> Flags:
+    """Return which heads are those of Protocol 2.0.
 
     A Protocol 1.0 packet of ID 253 cannot have length 0.
     """
-    second = packets.length >= len(_HEADER_2)
-    for index, byte in enumerate(_HEADER_2):
-        second &= packets.byte(index) == byte
+    second: Flags = head.astype(np.uint32) == _HEADER_2_NUMBER
     return second
 
 

@@ -123,22 +123,25 @@ class Losses:
             (self._lost, own),
         ):
             np.add(counts, np.bincount(due.servo[rows], minlength=len(counts)), out=counts)
-        answers = _before(bus, came, self._answers)
-        answered = _before(due.servo, came, self._answered)
         rows = np.flatnonzero(missing)
+        answers = _before(rows, bus, came, self._answers)
+        answered = _before(rows, due.servo, came, self._answered)
         joint = self._states.joint_of[due.servo[rows]]
         at = np.searchsorted(places.cycle, exchanges.cycle[exchange[rows]])
-        for row, of, place in zip(rows.tolist(), joint.tolist(), at.tolist(), strict=True):
+        missed = zip(
+            rows.tolist(), joint.tolist(), at.tolist(), answers.tolist(), answered.tolist(), strict=True
+        )
+        for row, of, place, seen, now in missed:
             servo, at_ns = int(due.servo[row]), int(exchanges.asked_ns[exchange[row]])
-            cycle, seen = int(cycles[exchange[row]]), int(answers[row])
+            cycle = int(cycles[exchange[row]])
             out = self._open.get(servo)
-            if out is not None and out.answered == answered[row]:
+            if out is not None and out.answered == now:
                 if at_ns - out.at_ns <= _APART_NS:
                     out.last, out.last_answers = cycle, seen
             elif (own[row] or nothing[row]) and len(self._outages) < _MOST_KEPT:
                 known = of >= 0 and place < len(places.cycle)
-                where = places.bins[place, :, of].tolist() if known else [-1] * len(QUANTITIES)
-                whole, now = bool(nothing[row]), int(answered[row])
+                where = places.bins[:, of, place].tolist() if known else [-1] * len(QUANTITIES)
+                whole = bool(nothing[row])
                 out = _Outage(servo, at_ns, cycle, where, seen, now, whole, cycle, seen)
                 self._open[servo] = out
                 self._outages.append(out)
@@ -382,14 +385,19 @@ def _moments(exchanges: Exchanges) -> Numbers:
     return np.where(exchanges.cycle > BEFORE_FIRST_CYCLE, exchanges.cycle, before)
 
 
-def _before(group: Numbers, came: Flags, so_far: Numbers) -> Numbers:
-    """Return, for each due reply, how many replies of the same group (bus or servo) came before it, and
-    add the new ones to the totals in `so_far`."""
-    order = np.argsort(group.astype(np.uint16), kind="stable")  # 16 bits are sorted without comparisons
-    count = np.cumsum(came[order])
-    begins = np.flatnonzero(np.diff(group[order], prepend=-1))
-    earlier: Numbers = np.repeat(count[begins] - came[order][begins], np.diff(np.append(begins, len(order))))
-    found = np.empty(len(group), np.int64)
-    found[order] = count - came[order] - earlier + so_far[group[order]]
+def _before(rows: Numbers, group: Numbers, came: Flags, so_far: Numbers) -> Numbers:
+    """Return, for some due replies, how many replies of the same group (bus or servo) came before them.
+
+    Args:
+        rows: Indices of these due replies, ascending.
+        group: Group of all due replies.
+        came: Which of all due replies came.
+        so_far: Number of replies of each group before; the new ones are added.
+    """
+    before = so_far[group[rows]]
+    for number in np.unique(group[rows]).tolist():
+        mine = np.flatnonzero(group[rows] == number)
+        of_group = np.cumsum(came & (group == number))
+        before[mine] += of_group[rows[mine]]
     so_far += np.bincount(group[came], minlength=len(so_far))
-    return found
+    return before

@@ -19,7 +19,7 @@ from dxlrun_analysis.finding import Finding, cause
 from dxlrun_analysis.plan_excerpt import LoggedBus
 from dxlrun_analysis.servos.exchanges import Exchanges, Loss
 from dxlrun_analysis.servos.foreign_writes import ForeignWrites
-from dxlrun_analysis.servos.logged_requests import IDS, Flags, Numbers, instruction_of
+from dxlrun_analysis.servos.logged_requests import IDS, Flags, Numbers, heads, instruction_of
 from dxlwire import BROADCAST_ID, protocol1, protocol2
 
 SPOILS, _FAILED = 1.5, 5.0
@@ -49,7 +49,8 @@ class OtherHosts:
     def add_exchanges(self, exchanges: Exchanges) -> None:
         """Add the foreign instructions, echoes, unrequested and missing replies in some exchanges."""
         others, due = exchanges.others, exchanges.due
-        self._sent.count_values(others.bus.astype(np.int64), instruction_of(others) * IDS + others.servo_id)
+        code = instruction_of(heads(others))
+        self._sent.count_values(others.bus.astype(np.int64), code * IDS + others.servo_id)
         for packet in others:
             self.writes.add_write(packet.bus, exchanges.buses[packet.bus], packet)
         self._unasked.count_values(exchanges.unasked // IDS, exchanges.unasked % IDS)

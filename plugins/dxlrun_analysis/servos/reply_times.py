@@ -43,6 +43,7 @@ _CHANCE = 1e-3  # Probability that all late replies of a bus come from one servo
 _LATE_US = 300  # Threshold of a late reply over the usual time on its bus
 _LONGEST_DELAY_US = 508  # Return Delay Time (5, 9) is at most 254 times 2 us
 _STEADY_US = 60  # A return delay is constant; the delay of a busy servo is not [i]
+_NEVER_NS = 1 << 62
 _LATE_NS = 2_000_000  # Threshold of a late adapter over the planned latency
 _LATE_SHARE = 0.1  # Share of its exchanges from which a bus is late
 
@@ -61,8 +62,14 @@ class ReplyTimes:
         """Counts by servo: late replies that were given up; exchanges with it alone; late ones of these."""
         self._exchanges = np.zeros(buses, np.int64)
 
-    def add_exchanges(self, exchanges: Exchanges, losses: Losses) -> None:
-        """Add the replies of some exchanges; late exchanges are also added to `losses`."""
+    def add_exchanges(self, exchanges: Exchanges, complete: tuple[Numbers, Numbers], losses: Losses) -> None:
+        """Add the replies of some exchanges; late exchanges are also added to `losses`.
+
+        Args:
+            exchanges: The exchanges.
+            complete: The complete ones among them, and their delay: `exchanges.complete()`.
+            losses: Receives the late exchanges.
+        """
         replies, late = exchanges.replies, exchanges.late
         count, requests = len(replies.exchange), exchanges.requests
         self._exchanges += np.bincount(
@@ -93,42 +100,49 @@ class ReplyTimes:
         kind = np.where(behind, _CHAINED, kinds[of])[alone]
         own_us = (late.at_ns[rows] - begun_ns[of])[alone] // 1000
         self._own_us.count_values(servo[alone] * len(_KINDS) + kind, own_us)
-        self._take_late(exchanges, own_ns, (of, servo, late.late_ns[rows]), losses)
+        self._take_late(exchanges, complete, own_ns, (of, servo, late.late_ns[rows]), losses)
 
     def _take_late(
-        self, exchanges: Exchanges, own_ns: Numbers, given_up: tuple[Numbers, ...], losses: Losses
+        self,
+        exchanges: Exchanges,
+        complete: tuple[Numbers, Numbers],
+        own_ns: Numbers,
+        given_up: tuple[Numbers, ...],
+        losses: Losses,
     ) -> None:
         """Count exchanges that were late as a whole, each for the servo whose reply took longest.
 
         Args:
             exchanges: The exchanges.
+            complete: The complete ones among them, and their delay.
             own_ns: Own time of each reply.
             given_up: Exchange, servo and lateness (ns) of each late reply that was given up.
             losses: Receives the late exchanges.
         """
         replies, count = exchanges.replies, len(exchanges.request)
         due = exchanges.requests.servos[exchanges.request]
-        answers = np.flatnonzero(replies.answers)
+        whole, extra_ns = complete
+        # Without a rate, the due time is unknown.
+        limits = [bus.latency_ns + _LATE_NS if bus.baud_rate > 0 else _NEVER_NS for bus in exchanges.buses]
+        late = extra_ns >= np.array(limits, np.int64)[exchanges.bus[whole]]
+        whole, extra_ns = whole[late], extra_ns[late]
+        is_late = np.zeros(count, np.bool_)
+        is_late[whole] = True
+        answers = np.flatnonzero(replies.answers & is_late[replies.exchange])
         of = replies.exchange[answers]
         order = np.lexsort((own_ns[answers], of))
-        last, slowest = np.full((2, count), -1, np.int64)
-        last[of], slowest[of[order]] = answers, answers[order]
-        # Without a rate, the due time is unknown.
-        whole = np.flatnonzero((np.bincount(of, minlength=count) == due) & (due > 0))
-        whole = whole[np.array([bus.baud_rate > 0 for bus in exchanges.buses])[exchanges.bus[whole]]]
-        extra_ns = replies.last_ns[last[whole]] - replies.due_ns[last[whole]]
-        limits = np.array([bus.latency_ns + _LATE_NS for bus in exchanges.buses], np.int64)
-        whole, extra_ns = (each[extra_ns >= limits[exchanges.bus[whole]]] for each in (whole, extra_ns))
+        slowest = np.full(count, -1, np.int64)
+        slowest[of[order]] = answers[order]
         lacks, first = np.unique(given_up[0], return_index=True)
         rows = np.append(whole, lacks)
         # Any servo of a fast status packet can be late.
         fast = exchanges.requests.fast[exchanges.request[whole]]
         of_any = exchanges.bus[whole] * IDS + BROADCAST_ID
         servo = np.append(np.where(fast, of_any, replies.servo[slowest[whole]]), given_up[1][first])
-        single = due == 1
-        asked = exchanges.bus * IDS + exchanges.requests.ids[exchanges.request, -1]
+        single, requests = due == 1, exchanges.requests
         for counts, at in ((self._single, np.flatnonzero(single)), (self._single_late, rows[single[rows]])):
-            np.add(counts, np.bincount(asked[at], minlength=len(counts)), out=counts)
+            asked = exchanges.bus[at] * IDS + requests.ids[requests.begins[exchanges.request[at]]]
+            np.add(counts, np.bincount(asked, minlength=len(counts)), out=counts)
         self._late_us.count_values(servo, np.append(extra_ns, given_up[2][first]) // 1000)
         losses.late(servo // IDS, exchanges, rows)
 

@@ -17,7 +17,7 @@ from dxlrun_analysis.plan_excerpt import LoggedBus, plan_of
 from dxlrun_analysis.servos.broken_replies import BrokenReplies
 from dxlrun_analysis.servos.exchanges import Exchanges, Pairing
 from dxlrun_analysis.servos.joint_states import JointStates
-from dxlrun_analysis.servos.logged_requests import IDS, Numbers
+from dxlrun_analysis.servos.logged_requests import IDS
 from dxlrun_analysis.servos.losses import Losses, ServoLosses
 from dxlrun_analysis.servos.other_host import OtherHosts
 from dxlrun_analysis.servos.reply_times import ReplyTimes
@@ -173,7 +173,8 @@ class Traffic:
         self._watch(exchanges)
         places = self._states.until(int(exchanges.cycle.max(initial=-1)), everything=final)
         self._losses.add_exchanges(exchanges, places)
-        self._reply_times.add_exchanges(exchanges, self._losses)
+        complete = exchanges.complete()
+        self._reply_times.add_exchanges(exchanges, complete, self._losses)
         self._broken.add_exchanges(exchanges)
         self._others.add_exchanges(exchanges)
         count, due, replies = len(self._asked), exchanges.due, exchanges.replies
@@ -195,18 +196,8 @@ class Traffic:
         self._reply_us.count_values(servo, took_ns // 1000)
         slower = took_ns > self._reply_max_ns[servo]
         np.maximum.at(self._reply_max_ns, servo[slower], took_ns[slower])
-        self._extra(exchanges, of, answers)
-
-    def _extra(self, exchanges: Exchanges, of: Numbers, answers: Numbers) -> None:
-        """Count the time of each complete exchange beyond wire time and return delay, by bus."""
-        replies, count = exchanges.replies, len(exchanges.request)
-        due = exchanges.requests.servos[exchanges.request]
-        complete = (np.bincount(of, minlength=count) == due) & (due > 0)
-        last = np.zeros(count, np.int64)
-        last[of] = answers
-        rows = last[complete]
-        extra_ns = np.maximum(replies.last_ns[rows] - replies.due_ns[rows], 0)
-        self._extra_us.count_values(exchanges.bus[complete], extra_ns // 1000)
+        rows, extra_ns = complete
+        self._extra_us.count_values(exchanges.bus[rows], np.maximum(extra_ns, 0) // 1000)
 
     def _servo(self, index: int) -> ServoTraffic:
         bus, servo_id = self._pairing.buses[index // IDS], index % IDS

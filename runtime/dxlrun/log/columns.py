@@ -61,12 +61,12 @@ class PacketColumns(Sequence[LoggedPacket]):
 
     def __iter__(self) -> Iterator[LoggedPacket]:
         """Yield the packets one by one; computing with the columns is faster."""
-        data = self.data.tobytes()
+        data = self.data.data
         columns = (self.bus, self.kind, self.servo_id, self.first_ns, self.last_ns, self.start, self.length)
         for bus, kind, servo_id, first_ns, last_ns, start, length in zip(
             *(column.tolist() for column in columns), strict=True
         ):
-            body = data[start : start + length]
+            body = bytes(data[start : start + length])
             yield LoggedPacket(bus, PacketKind(kind), servo_id, first_ns, last_ns, body)
 
     def select_rows(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> PacketColumns:
