@@ -33,8 +33,9 @@ def parser() -> argparse.ArgumentParser:
         "--peers",
         default=",".join(kind.name for kind in HOSTS),
         help="hosts to measure: ours (dxlrun, every packet kept for a log), polled (the same, polling for "
-        "replies), unrecorded (ours without a log), sdk, rustypot; sdk-fast and rustypot-fast use fast sync "
-        "read (Protocol 2.0); a host that is not installed is left out",
+        "replies), unrecorded (ours without a log), floor (the same bytes by write and read, without work), "
+        "sdk, rustypot; sdk-fast and rustypot-fast use fast sync read (Protocol 2.0); a host that is not "
+        "installed is left out",
     )
     made.add_argument(
         "--against",

@@ -31,6 +31,7 @@ from dxlwire.control_table import find_table
 from dxlwire.packets import PacketKind, PacketLog
 from dxlwire.port.ports import ReplyPolling, SerialPort, SerialPorts
 from exchange.case import Case, Registers
+from exchange.floor import Floor
 from exchange.peers import Rustypot, Sdk
 
 _MOST_RECOVERIES = 20
@@ -222,6 +223,7 @@ HOSTS: Sequence[HostKind] = (
     HostKind("polled", "dxlrun", lambda path, case, plan, _: Ours(path, plan, polled=True)),
     HostKind("unrecorded", "dxlrun", lambda path, case, plan, _: Ours(path, plan, recorded=False)),
     HostKind("bus", "dxlwire", lambda path, case, plan, _: Script(path, case, plan)),
+    HostKind("floor", "dxlrun", lambda path, case, plan, _: Floor(path, case, plan)),
     HostKind("sdk", "dynamixel_sdk", _sdk),
     HostKind("sdk-fast", "dynamixel_sdk", partial(_sdk, fast=True), (2.0,)),
     HostKind("rustypot", "rustypot", _rustypot),

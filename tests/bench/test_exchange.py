@@ -28,7 +28,8 @@ def test_every_host_exchanges_the_same_bytes_with_the_canned_responder(protocol:
     hosts = {one.host: one for one in found.hosts}
     assert set(hosts) == set(ALL) if protocol == 2.0 else set(hosts) == {n for n in ALL if "fast" not in n}
     registers = Registers.of(case.plan(wire=False))
-    assert hosts["ours"].sent_bytes == hosts["unrecorded"].sent_bytes
+    assert hosts["ours"].sent_bytes == hosts["unrecorded"].sent_bytes == hosts["floor"].sent_bytes
+    assert hosts["ours"].received_bytes == hosts["floor"].received_bytes
     for name in ("sdk", "rustypot"):
         one = hosts[name]
         assert one.sent_bytes == hosts["sdk"].sent_bytes
