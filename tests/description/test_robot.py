@@ -51,13 +51,6 @@ def test_what_is_left_out_has_its_default() -> None:
     assert robot.recording.directory == "logs"
 
 
-def test_a_robot_needs_buses_and_joints() -> None:
-    assert desk.refusals("name: x\nloop: {rate: 1}\nbuses: {}\njoints: {}\n") == [
-        "robot.yaml:3:8: buses has too few entries; write at least 1",
-        "robot.yaml:4:9: joints has too few entries; write at least 1",
-    ]
-
-
 def test_the_text_and_the_places_are_kept() -> None:
     description = desk.robot(TORSO)
     assert description.text == TORSO
@@ -65,16 +58,6 @@ def test_the_text_and_the_places_are_kept() -> None:
     assert description.marks.key("joints", "elbow") == Mark(file, 12, 3)
     assert description.marks.value("controllers", "arm", "joints", 1) == Mark(file, 15, 64)
     assert description.marks.value("joints", "elbow", "limits", "position") == Mark(file, 12, 3)
-
-
-def test_entry_and_section_that_are_not_mappings_are_reported_together() -> None:
-    head = TORSO[: TORSO.index("controllers:")]
-    found = desk.refusals(head.replace("loop:\n", "loop: 50\nlop:\n") + "controllers: {a: 5}\n")
-    assert [one.split(": ", 1)[1].partition(";")[0] for one in found] == [
-        "loop is 50, but must be a mapping",
-        "the file has an unknown key 'lop'",
-        "controllers.a is 5, but must be a mapping",
-    ]
 
 
 TEXT = """name: one

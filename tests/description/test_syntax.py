@@ -90,16 +90,6 @@ def test_a_byte_order_mark_and_other_line_ends_are_read() -> None:
     assert description.marks.value("joints", "elbow", "id") == Mark(str(path), 12, 26)
 
 
-def test_a_tag_is_refused_and_the_rest_still_checked() -> None:
-    text = TORSO.replace("name: torso", "name: !!python/object/apply:os.system [ls]").replace(
-        "id: 5", "id: 500"
-    )
-    assert [problem.split("; ")[0] for problem in desk.refusals(text)] == [
-        "robot.yaml:1:7: the tag !!python/object/apply:os.system is refused",
-        "robot.yaml:12:26: joints.elbow.id is 500, but must be at most 253",
-    ]
-
-
 def test_duplicate_merge_empty_and_compound_keys_are_refused_together() -> None:
     text = TORSO + "recording: {}\n<<: {a: 1}\n? [a, b]\n: 1\n'': 2\n${rate}: 3\n'<<': 4\n"
     assert [refusal.partition("; known keys: ")[0] for refusal in desk.refusals(text)] == [
