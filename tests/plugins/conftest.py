@@ -3,7 +3,6 @@
 import os
 import subprocess
 import sys
-import venv
 from collections.abc import Callable
 from pathlib import Path
 
@@ -49,12 +48,18 @@ def wheels(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def fresh(wheels: Path, tmp_path_factory: pytest.TempPathFactory) -> Shell:
     """Return a function that runs a line in an environment that knows only the two wheels and pytest."""
     environment = tmp_path_factory.mktemp("fresh") / "venv"
-    venv.create(environment, with_pip=True)
+    ours, theirs = next(wheels.glob("dxlrun-*.whl")), next(wheels.glob("dxlrun_easing-*.whl"))
+    needed = f"hatchling editables {ours} '{theirs}[test]'"
+    make = f"{sys.executable} -m venv --clear {environment}"
+    make += f" && {environment}/bin/pip install --quiet --no-compile {needed}"
+    if uv := os.environ.get("UV"):  # a second of a processor instead of fifteen
+        by_uv = f"{uv} venv --quiet --seed --python {sys.executable} {environment}"
+        by_uv += f" && {uv} pip install --quiet --python {environment} {needed}"
+        make = f"({by_uv}) || ({make})"
+    made = bash(make, wheels, Path(sys.executable).parent)
+    assert made.returncode == 0, made.stderr
 
     def shell(line: str, directory: Path, *, isolated: bool = False) -> subprocess.CompletedProcess[str]:
         return bash(line, directory, environment / "bin", isolated=isolated)
 
-    ours, theirs = next(wheels.glob("dxlrun-*.whl")), next(wheels.glob("dxlrun_easing-*.whl"))
-    installed = shell(f"pip install --quiet --no-compile hatchling editables {ours} '{theirs}[test]'", wheels)
-    assert installed.returncode == 0, installed.stderr
     return shell
