@@ -52,7 +52,7 @@ def live(run):
 
 
 @pytest.fixture(scope="package")
-def browser(tmp_path_factory):
+def chromium(tmp_path_factory):
     if CHROMIUM is None:
         pytest.skip("no Chromium is installed; apt install chromium")
     if not files("dxlrun_view").joinpath("page", "build", "page.js").is_file():
@@ -61,6 +61,14 @@ def browser(tmp_path_factory):
     one = Browser(place, "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
     yield one
     one.close()
+
+
+@pytest.fixture
+def browser(chromium):
+    """A browser in which no page of an earlier test is left that complains."""
+    chromium.open("about:blank")
+    chromium.events.clear()
+    return chromium
 
 
 @pytest.fixture
