@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Self
 
-from pydantic import Field
+from pydantic import AfterValidator, Field, model_validator
 
 from dxlrun import Angle, Length
 from dxlrun.tooling.features import Section
 from dxlrun.tooling.files import Form, Name, key
+from dxlrun_space.space_goals import PoseCommand, PoseGoal, at_most_a_turn, check_turns
 
 _Place = Annotated[Length, Field(ge=-100, le=100)]  # As in the command `pose`
-_Turns = Annotated[tuple[Angle, Angle, Angle], Field(strict=False)]
+_Turn = Annotated[Angle, AfterValidator(at_most_a_turn)]
+_Turns = Annotated[tuple[_Turn, _Turn, _Turn], Field(strict=False)]
 _Quaternion = Annotated[tuple[float, float, float, float], Field(strict=False)]
 
 
@@ -30,6 +32,16 @@ class TipPose(Form):
     near: dict[Name, Angle] = key(
         "Joints of the solution to prefer, where there are several.", "{elbow: 9 deg}", {}
     )
+
+    @model_validator(mode="after")
+    def _has_one_orientation(self) -> Self:
+        check_turns(self.quaternion, self.rpy)
+        return self
+
+    def as_goal(self) -> PoseGoal:
+        """Return the pose as a goal."""
+        fields = self.model_dump(include={"x", "y", "z", "rpy", "quaternion"})
+        return PoseCommand.model_validate(fields).as_goal()
 
 
 STAGE: Section[dict[str, TipPose]] = Section(

@@ -28,11 +28,24 @@ def _rad(value: object) -> object:
     """Convert an angle; 0 needs no unit, and more than a turn is deg without its unit."""
     if isinstance(value, str):
         value = 0.0 if value.strip() in ("0", "0.0") else TypeAdapter(Angle).validate_python(value)
-    if isinstance(value, int | float) and abs(value) > 2 * math.pi:
+    return at_most_a_turn(value) if isinstance(value, int | float) else value
+
+
+def at_most_a_turn(value: float) -> float:
+    """Return an angle, rad; raise ValueError if it is more than a turn."""
+    if abs(value) > 2 * math.pi:
         raise ValueError(
             f"{value:g} rad is more than a turn; write at most a turn, with its unit, such as 90deg"
         )
     return value
+
+
+def check_turns(quaternion: Quaternion | None, *others: Vector | None) -> None:
+    """Raise ValueError for more than one orientation, or a quaternion that is not of length 1."""
+    if sum(each is not None for each in (quaternion, *others)) > 1:
+        raise ValueError("give only one of rpy, drpy and quaternion; remove the others")
+    if quaternion is not None and abs(math.hypot(*quaternion) - 1) > NORM:
+        raise ValueError(f"the quaternion has length {math.hypot(*quaternion):.4g}; scale it to length 1")
 
 
 def _items(value: object) -> object:
@@ -90,14 +103,9 @@ class PoseCommand(CommandModel):
             if given or self.frame or "path" in self.model_fields_set:
                 raise ValueError("a pose by name has no other coordinates, frame or path; remove them")
             return self
-        if sum(each is not None for each in turns) > 1:
-            raise ValueError("give only one of rpy, drpy and quaternion")
         if not given:
             raise ValueError("give a coordinate or an orientation, such as dz=5cm")
-        if self.quaternion is not None and abs(math.hypot(*self.quaternion) - 1) > NORM:
-            raise ValueError(
-                f"the quaternion has length {math.hypot(*self.quaternion):.4g}; scale it to length 1"
-            )
+        check_turns(self.quaternion, self.rpy, self.drpy)
         return self
 
     def as_goal(self, joints: Sequence[str] = ()) -> PoseGoal:

@@ -4,7 +4,6 @@ from dxlrun.channels.cycle import Commands as Commands
 from dxlrun.channels.cycle import Floats as Floats
 from dxlrun.channels.cycle import States as States
 from dxlrun.contract.controller import LIVE as LIVE
-from dxlrun.contract.controller import NAMED_POSE as NAMED_POSE
 from dxlrun.contract.controller import NOT_BY_JOINT as NOT_BY_JOINT
 from dxlrun.contract.controller import CommandModel as CommandModel
 from dxlrun.contract.controller import Context as Context
@@ -23,6 +22,7 @@ from dxlrun.contract.hookspecs import Command as Command
 from dxlrun.contract.hookspecs import hookimpl as hookimpl
 from dxlrun.contract.joint_controller import JointController as JointController
 from dxlrun.contract.joint_controller import reading as reading
+from dxlrun.contract.named_pose import NAMED_POSE as NAMED_POSE
 from dxlrun.contract.polynomial import Polynomial as Polynomial
 from dxlrun.contract.serial_line import open_serial as open_serial
 from dxlrun.description.base_form import Mistake as Mistake

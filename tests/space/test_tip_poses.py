@@ -85,6 +85,9 @@ def test_motion_file_and_keyframes_lead_the_tip_to_poses(tmp_path: Path) -> None
     wrong.write_text(f"name: wrong\nmotions:\n  - {{controller: right_hand, points: {points}}}\n")
     with pytest.raises(DxlrunError, match="the robot has no pose right_upp; did you mean right_up"):
         op3.play(wrong)
+    wrong.write_text(wrong.read_text().replace("right_upp", "{tip: r_hand, x: 6 cm, y: -22 cm, z: 16 cm}"))
+    assert op3.wait(op3.play(wrong).goal).status == "reached"
+    assert tip(op3) == pytest.approx((6, -22, 16), abs=0.3)
     koch = robot_of("koch_space")
     koch.switch(activate=["moves"], deactivate=["hand"])
     assert koch.send("moves", "play", {"motion": "pick"}).goal.wait().status == "reached"

@@ -22,7 +22,7 @@ from typing import Any
 import msgspec
 import numpy as np
 from msgspec import structs
-from pydantic import ValidationError
+from pydantic import TypeAdapter, ValidationError
 
 from dxlrun.compile.controller_entry import CompiledController
 from dxlrun.compile.joints.compiled_joints import CompiledJoint
@@ -40,8 +40,9 @@ from dxlrun.compile.motion_samples import (
 )
 from dxlrun.compile.problems import Problems, RobotFile
 from dxlrun.contract.controller import Controller, SpeedPeak
+from dxlrun.description.base_form import Name
 from dxlrun.description.document import refusal
-from dxlrun.description.form_problems import sentences_of
+from dxlrun.description.form_problems import problems_of, sentences_of
 from dxlrun.description.motion import (
     FormulaPart,
     MotionDescription,
@@ -50,7 +51,7 @@ from dxlrun.description.motion import (
     Target,
     read_motion,
 )
-from dxlrun.description.units import Measure
+from dxlrun.description.units import Measure, Position
 from dxlrun.errors import InputError, Mark, suggestion, what_and_fix
 from dxlrun.plan.loop_plan import SETTLE_NS, JointPlan, ScheduledCommand, ScheduledGoal
 from dxlrun.plan.robot_plan import MotionPart
@@ -68,6 +69,7 @@ _EXAMPLES: Mapping[JointUnit, Mapping[Quantity, str]] = {
 }
 LEAD_NS = 1_000_000_000
 """Time from the start of a trajectory command to its first point, ns, if that point is at t = 0."""
+_BY_JOINT: TypeAdapter[dict[str, Measure]] = TypeAdapter(dict[Name, Position], config={"strict": True})
 MOST_TARGETS = 200_000
 """Most targets that all formulas of a motion file may have: 20 joints for 100 s at 100 Hz. Each takes about
 300 bytes and 5 us."""
@@ -111,16 +113,22 @@ def with_poses(motion: MotionDescription, poses: Poses) -> MotionDescription:
     def posed(point: Point, number: int, index: int) -> Point:
         if point.pose is None:
             return point
+        path = ("motions", index, "points", number, "pose")
         try:
             positions = poses.find_positions(point.pose)
+            found = (
+                _BY_JOINT.validate_python(point.pose)
+                if positions is None
+                else {joint: Measure(at, poses.joints[joint].unit.si) for joint, at in positions.items()}
+            )
         except WrongPose as wrong:
-            mark = motion.marks.value("motions", index, "points", number, "pose")
-            problems.error(mark, *what_and_fix(wrong))
+            for problem in wrong.problems:
+                problems.error(motion.marks.value(*path), *problem)
             return point
-        targets = {
-            joint: Target(position=Measure(position, poses.joints[joint].unit.si))
-            for joint, position in positions.items()
-        }
+        except ValidationError as error:
+            problems.extend(problems_of(error, motion.marks, path))
+            return point
+        targets = {joint: Target(position=at) for joint, at in found.items()}
         return point.model_copy(update={"joints": targets | point.joints})
 
     parts = [

@@ -12,7 +12,7 @@ from dxlrun.compile.joints.poses import Poses, WrongPose
 from dxlrun.compile.problems import RobotFile
 from dxlrun.description.document import KeyPath
 from dxlrun.description.robot import PoseStep, TorqueStep, WrittenPolicy
-from dxlrun.errors import suggestion, what_and_fix
+from dxlrun.errors import suggestion
 from dxlrun.features.feature import PolicyKey
 from dxlrun.plan.policy_plan import (
     HOLD,
@@ -34,7 +34,10 @@ _EXAMPLES: Mapping[JointUnit, str] = {ROTARY: "60 deg", LINEAR: "20 mm"}
 
 
 def compile_poses(
-    file: RobotFile, joints: Mapping[str, CompiledJoint], contributions: Mapping[str, Contribution]
+    file: RobotFile,
+    joints: Mapping[str, CompiledJoint],
+    urdf: str | None,
+    contributions: Mapping[str, Contribution],
 ) -> Poses:
     """Return all poses: those of the section `poses`, checked, and those of features, by section."""
     _check_poses(file, joints)
@@ -45,7 +48,9 @@ def compile_poses(
             if name in poses:
                 file.error(file.key(section, name), f"{name} is already the name of a pose", "rename one")
             poses[name] = positions
-    return Poses(poses, {name: joint.plan for name, joint in joints.items()}, file.description.omitted)
+    plans = {name: joint.plan for name, joint in joints.items()}
+    wrong = len(plans) < len(file.robot.joints) or (urdf is None and file.robot.model is not None)
+    return Poses(poses, plans, file.description.omitted, urdf, wrong)
 
 
 def compile_policies(
@@ -113,9 +118,10 @@ def _policy(
         elif isinstance(step, PoseStep):
             mark_path = ("policies", name, index, "pose")
             try:
-                angles = poses.find_positions(step.pose)
+                angles = poses.find_named(step.pose)
             except WrongPose as wrong:
-                file.error(file.at(*mark_path), *what_and_fix(wrong))
+                for problem in wrong.problems:
+                    file.error(file.at(*mark_path), *problem)
             else:
                 linear = [joint for joint in angles if joint in joints and joints[joint].plan.unit is LINEAR]
                 if linear and step.linear_speed is None:

@@ -184,7 +184,7 @@ def compile_robot(
     sources = tuple(source for each in contributions for source in each.sources)
     devices = (device for each in contributions for device in each.devices)
     simulation = compile_simulation(file, joints, devices, motors)
-    poses = compile_poses(file, joints, by_feature)
+    poses = compile_poses(file, joints, urdf, by_feature)
     controllers = compile_controllers(file, plugins, contributions, poses)
     providers = {one.name: one.states for one in sources} | {
         name: one.plan.provides for name, one in controllers.items() if one.plan.provides

@@ -10,8 +10,7 @@ from typing import ClassVar, Final, Generic, Protocol, TypeVar
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, GetJsonSchemaHandler
-from pydantic_core import CoreSchema
+from pydantic import BaseModel, ConfigDict
 
 from dxlrun.channels.cycle import Commands, Floats, States
 from dxlrun.description.base_form import ParametersModel
@@ -50,22 +49,6 @@ class NotByJoint(msgspec.Struct, frozen=True):
 
 
 NOT_BY_JOINT: Final = NotByJoint()
-
-
-class NamedPose(msgspec.Struct, frozen=True):
-    """Marker of positions by joint that can be the name of a pose: `Annotated[dict[str, Angle], NAMED_POSE]`.
-
-    The class gets the positions: in its parameters as texts with units, in a command as numbers in SI.
-    """
-
-    def __get_pydantic_json_schema__(
-        self, schema: CoreSchema, handler: GetJsonSchemaHandler
-    ) -> dict[str, object]:
-        """Return the JSON Schema of the positions or a name."""
-        return {"anyOf": [handler(schema), {"type": "string"}]}
-
-
-NAMED_POSE: Final = NamedPose()
 
 
 class RegisterChange(msgspec.Struct, frozen=True):

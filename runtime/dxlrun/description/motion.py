@@ -51,19 +51,33 @@ class Target(Form):
         return self.position, self.velocity, self.acceleration
 
 
+def _kind_of_pose(pose: object) -> str:
+    return "<positions>" if isinstance(pose, dict) else "<name>"
+
+
+WrittenPose = Annotated[
+    Annotated[Name, Tag("<name>")] | Annotated[dict[str, object], Tag("<positions>")],
+    Discriminator(_kind_of_pose),
+]
+"""Pose of a point, whose joints `Poses` finds."""
+
+
 class Point(Form):
     """Form of a point of a motion: a time, and goals of some joints."""
 
     time: Duration = key("Time since the start of the part.", "1 s")
     joints: dict[Name, Target] = key("Targets by joint.", "{head_joint: {position: 30 deg}}", {})
-    pose: Name | None = key(
-        "Pose of the robot file, for the joints that `joints` does not name.", "rest", None
+    pose: WrittenPose | None = key(
+        "Pose for the joints that `joints` does not name: a name of the robot file, positions by joint, or a "
+        "pose of a link as in `tip_poses`.",
+        "rest",
+        None,
     )
 
     @model_validator(mode="after")
     def _moves_something(self) -> Self:
         if not self.joints and self.pose is None:
-            raise validation_error("the point has no targets", "add joints, or the name of a pose")
+            raise validation_error("the point has no targets", "add joints, or a pose")
         return self
 
 

@@ -216,7 +216,7 @@ class Preparation:
         """Return the preparation of a robot's commands by its plan and the installed plug-ins."""
         loop, plugins = plan.loop, load_plugins(files=plan.included)
         joints = {joint.name: joint for joint in loop.joints}
-        poses = Poses(plan.poses, joints, plan.omitted)
+        poses = Poses(plan.poses, joints, plan.omitted, plan.urdf)
         return cls(joints, plugins, loop.sources, plan.urdf, plan.groups, plan.omitted, poses)
 
     def take_servo_limits(self, joint: str, limits: tuple[ServoLimit, ...]) -> None:

@@ -2,10 +2,12 @@
 
 A feature is a package with files of fixed names. Each has an object `STAGE` of a class of this page:
 `Section` in `form.py`, `JointKey` in `joint_key.py`, `ServoKey` in `servo_key.py`, `PolicyKey` in
-`policy_key.py`, `CompileStage` in `compile.py`, `SettingsStage` in `settings.py`, `LayerStage` in `layer.py`,
-`BusStage` in `runtime.py`, `MonitorStage` in `monitor.py`, `SafeStage` in `safe.py`, `ProcessStage` in
-`process.py`, `ReaderStage` in `reader.py`, `TableStage` in `table.py`. One of the first four is required. A
-small feature is one module with these objects in a tuple `STAGES`.
+`policy_key.py`, `PoseStage` in `pose_form.py`, `CompileStage` in `compile.py`,
+`SettingsStage` in `settings.py`,
+`LayerStage` in `layer.py`, `BusStage` in `runtime.py`, `MonitorStage` in `monitor.py`,
+`SafeStage` in `safe.py`, `ProcessStage` in `process.py`, `ReaderStage` in `reader.py`, `TableStage` in
+`table.py`. One of the first four is required. A small feature is one module with these objects in a tuple
+`STAGES`.
 Forms use the names of `dxlrun.tooling.files`. The hook `dxlrun_features` registers the feature:
 
     from dxlrun import hookimpl
@@ -37,6 +39,7 @@ if TYPE_CHECKING:
     from dxlrun.compile.joints.described_servos import DescribedServo as DescribedServo
     from dxlrun.compile.problems import RobotFile as RobotFile
     from dxlrun.contract.hardware import Hardware as Hardware
+    from dxlrun.contract.named_pose import PoseStage as PoseStage
     from dxlrun.control.monitors.monitor_stage import Monitor as Monitor
     from dxlrun.control.monitors.monitor_stage import MonitorStage as MonitorStage
     from dxlrun.control.monitors.policy_actions import PolicyActions as PolicyActions

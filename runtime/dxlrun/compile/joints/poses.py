@@ -1,4 +1,6 @@
-"""Poses: converts the names of poses into positions of joints, for files and for commands of clients.
+"""Poses: converts names of poses, and poses in the form of a feature, into positions of joints.
+
+Files, and commands of clients, find their poses here.
 
 A class declares each field that can have a name by `NAMED_POSE`.
 """
@@ -11,33 +13,68 @@ from types import UnionType
 from typing import Annotated, Final, Union, get_args, get_origin
 
 import msgspec
-from pydantic import BaseModel
+from pydantic import BaseModel, ValidationError
 
-from dxlrun.contract.controller import NAMED_POSE
+from dxlrun.contract.named_pose import NAMED_POSE, PoseStage
 from dxlrun.description.base_form import ParametersModel
 from dxlrun.description.document import KeyPath
+from dxlrun.description.form_problems import sentences_of
 from dxlrun.errors import suggestion, what_and_fix
+from dxlrun.features import installed_features, stages
 from dxlrun.plan.loop_plan import JointPlan
 
+_MOST_MISTAKES: Final = 5
 _EACH: Final = -1
 """Step of a path to every entry of a list or mapping."""
 
 
 class WrongPose(ValueError):
-    """Raised for a pose without positions of joints, as text `problem; fix`."""
+    """Raised for a pose without positions of joints; its text has a line `problem; fix` for each problem."""
+
+    @property
+    def problems(self) -> list[tuple[str, str]]:
+        """Problems with their fixes."""
+        return [*map(what_and_fix, str(self).splitlines())]
 
 
 class Poses(msgspec.Struct, frozen=True):
-    """Poses of a robot by name."""
+    """Poses of a robot: those with names, and those that features solve."""
 
     named: Mapping[str, Mapping[str, float]] = {}
     """Positions of joints, rad or m; empty: the pose needs a joint that the run omits."""
     joints: Mapping[str, JointPlan] = {}
     omitted: Sequence[str] = ()
     """Joints and groups that the run omits."""
+    urdf: str | None = None
+    """Text of the robot's URDF."""
+    has_mistakes: bool = False
+    """True if a joint or the URDF has a mistake, which is reported; features solve no poses then."""
 
-    def find_positions(self, name: str) -> Mapping[str, float]:
-        """Return the positions of a pose; raise WrongPose if it is unknown, or needs an omitted joint."""
+    def find_positions(self, written: object) -> Mapping[str, float] | None:
+        """Return the positions of the pose with a name, or of a pose in the form of a feature; None: neither.
+
+        Raises:
+            WrongPose: The name is unknown, the pose needs an omitted joint, or a feature refuses it.
+        """
+        if isinstance(written, str):
+            return self.find_named(written)
+        if not isinstance(written, Mapping) or written.keys() <= self.joints.keys():
+            return None
+        for _, stage in stages(PoseStage, installed_features()):
+            if stage.key in written:
+                return {} if self.has_mistakes else self._solve(stage, written)
+        return None
+
+    def _solve(self, stage: PoseStage[BaseModel], written: object) -> Mapping[str, float]:
+        try:
+            return stage.solve(stage.form.model_validate(written), self.urdf, self.joints)
+        except ValidationError as error:
+            raise WrongPose("\n".join(sentences_of(error, "the pose", stage.form, _MOST_MISTAKES))) from None
+        except ValueError as error:
+            raise WrongPose(str(error)) from None
+
+    def find_named(self, name: str) -> Mapping[str, float]:
+        """Return the positions of the pose with a name; raise WrongPose as `find_positions`."""
         if positions := self.named.get(name):
             return {joint: at for joint, at in positions.items() if joint in self.joints}
         if name in self.named:
@@ -50,23 +87,21 @@ class Poses(msgspec.Struct, frozen=True):
     def put_in(
         self, written: object, model: type[BaseModel]
     ) -> tuple[object, list[tuple[KeyPath, str, str]]]:
-        """Return a command or parameters with positions in place of names, and the mistakes.
+        """Return a command or parameters with positions of joints in place of poses, and the mistakes.
 
-        A wrong name becomes a pose without joints. Parameters get texts with units, commands numbers in SI.
-        Each mistake is the path of the name, the problem and the fix.
+        A wrong pose becomes one without joints. Parameters get texts with units, commands numbers in SI. Each
+        mistake is the path of the pose, the problem and the fix.
         """
         wrong: list[tuple[KeyPath, str, str]] = []
 
         def put_positions(value: object, at: KeyPath) -> object:
-            if not isinstance(value, str):
-                return value
             try:
                 found = self.find_positions(value)
             except WrongPose as error:
-                wrong.append((at, *what_and_fix(error)))
+                wrong.extend((at, *problem) for problem in error.problems)
                 return {}
-            if not issubclass(model, ParametersModel):
-                return found
+            if found is None or not issubclass(model, ParametersModel):
+                return value if found is None else found
             return {joint: f"{float(value)!r} {self.joints[joint].unit.si}" for joint, value in found.items()}
 
         for place in pose_places(model):

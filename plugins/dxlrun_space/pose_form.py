@@ -1,0 +1,66 @@
+"""Poses of links as positions of joints: those of `tip_poses`, and those in place of the name of a pose."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from dxlrun.tooling.features import PoseStage
+from dxlrun.tooling.plans import JointPlan
+from dxlrun.tooling.robots import Urdf, read_urdf
+from dxlrun_space.chain import BASE, Chain, WrongChain
+from dxlrun_space.form import TipPose
+from dxlrun_space.path import out_of_reach, suffices
+from dxlrun_space.solver import FULL, Solver, finish_search
+
+
+class SolvedPose(NamedTuple):
+    """Joints that have a pose."""
+
+    solver: Solver
+    positions: tuple[float, ...]
+    orientation_error: float
+    """Angle to the orientation that was asked for, rad; 0 if none was."""
+
+
+def solve_pose(pose: TipPose, chain: Chain, joints: Mapping[str, JointPlan]) -> SolvedPose:
+    """Return the joints of a chain that have a pose; raise WrongChain if there are none."""
+    for joint in chain.joints:
+        if joint not in joints:
+            what = f"{joint} moves {pose.tip}, but is omitted or has no servo"
+            raise WrongChain("tip", what, f"run with {joint}, or add it to `joints`")
+    for joint in pose.near:
+        if joint not in chain.joints:
+            raise WrongChain("near", f"{joint} does not move {pose.tip}", f"write {', '.join(chain.joints)}")
+    plans = [joints[joint] for joint in chain.joints]
+    near = [pose.near.get(joint) for joint in chain.joints]
+    solver = Solver(chain, [plan.lower for plan in plans], [plan.upper for plan in plans], near)
+    start = tuple(each or 0.0 for each in near)
+    goal = pose.as_goal()
+    exact = goal.asks_orientation and len(plans) >= FULL
+    target = goal.target(BASE, chain.pose(start))
+    search = (
+        solver.search(target, start, exact=exact)
+        if goal.asks_orientation
+        else solver.search_place(target, start)
+    )
+    found = finish_search(search)
+    if not suffices(found.residual, exact):
+        fix = "move the pose, or give it another orientation"
+        raise WrongChain("", out_of_reach(found.residual, exact), fix)
+    return SolvedPose(solver, found.positions, found.residual.orientation if goal.asks_orientation else 0.0)
+
+
+def chain_of(pose: TipPose, urdf: Urdf | None) -> Chain:
+    """Return the chain of a pose; raise WrongChain if the robot has none."""
+    if urdf is None:
+        raise WrongChain("tip", "the robot file names no URDF", "write `model: {urdf: NAME.urdf}`")
+    return Chain(urdf, pose.base, pose.tip)
+
+
+def _joints_of(pose: TipPose, urdf: str | None, joints: Mapping[str, JointPlan]) -> dict[str, float]:
+    chain = chain_of(pose, None if urdf is None else read_urdf(urdf))
+    return dict(zip(chain.joints, solve_pose(pose, chain, joints).positions, strict=True))
+
+
+STAGE = PoseStage("tip", TipPose, _joints_of)
