@@ -72,29 +72,6 @@ def test_a_request_is_answered_when_all_servos_have_answered_by_what_went_wrong(
     assert story.answer() == (Code.TORQUE_NOT_SWITCHED, {"joint": ("j1",), "problem": why})
 
 
-@pytest.mark.parametrize(
-    ("cycles", "happens", "lost", "invalid"),
-    [
-        (14, {2: Torque.REBOOTING}, False, 0),
-        (14, {2: Torque.REBOOTING, 12: Torque.ON}, False, 0),
-        (30, {2: Torque.REBOOTING, 12: Torque.ON, 15: Torque.LOST}, True, 15),
-        (30, {2: Torque.REBOOTING, 12: Torque.LOST}, True, 18),  # given up
-        (14, {2: Torque.LOST}, True, 12),  # it was not this that was requested
-    ],
-)
-def test_a_servo_that_reboots_by_request_is_not_lost_and_one_that_stays_away_is(
-    story, cycles, happens, lost, invalid
-):
-    """The policy for lost servos would hold its controllers, or end the run."""
-    shown = {
-        cycle: story.shows(2, torque=torque, valid=torque is Torque.ON, age_ns=10**9)
-        for cycle, torque in happens.items()
-    }
-    story.run(cycles, {1: story.asks("reboot", joints=["j2"])} | shown)
-    assert story.loop.manager._lost == ([2] if lost else [])
-    assert story.result.invalid == (0, 0, invalid)
-
-
 @pytest.mark.parametrize(("row", "request_torque"), [(2, False), (1, True)], ids=["free", "commanded"])
 def test_the_goal_of_a_limp_joint_follows_it_and_its_first_goals_with_torque_are_slow(
     story, row, request_torque
