@@ -154,6 +154,13 @@ def test_cycle_is_measured_by_its_own_period(tmp_path):
     assert sentence.endswith("; a cycle took up to 8000 us, its write 7400 us: own work.")
 
 
+def test_pause_that_no_client_ends_lasts_until_its_lease_expires(tmp_path, monkeypatch):
+    monkeypatch.setattr("dxlrun.control.steering.PAUSE_LEASE_NS", 200 * MS)
+    log = run(tmp_path, {10: [ask("pause")], 40: [ask("pause")], 45: [ask("resume")], 60: [ask("pause")]})
+    pauses = [(round(one.begin_s, 2), one.periods) for one in analyze(log).totals.pauses]
+    assert pauses == [(0.2, 11), (0.8, 5), (1.2, 11)]
+
+
 def test_pause_that_the_run_ends_in_lasts_to_the_end(tmp_path):
     (pause,) = analyze(run(tmp_path, {10: [ask("pause")], 20: [ask("stop")]})).totals.pauses
     assert pause.periods == 11

@@ -86,6 +86,8 @@ class SteeringHistory:
         """Time at which the last stream of each controller ran out, and whether its joints were held."""
         self._left_ns: dict[str, int] = {}
         """Time at which a controller whose last stream ran out was deactivated."""
+        self._expired_ns: list[int] = []
+        """Times at which a pause ended without a client, oldest first, that are not matched yet."""
 
     def add_slice(self, log: Log) -> None:
         """Add the commands and their answers in the next slice of the log."""
@@ -97,6 +99,8 @@ class SteeringHistory:
         for event in log.events:
             if event.code in _ANSWERS:
                 self._events.append(event)
+            elif event.code == EventCode.STALE_COMMAND and event.source == "loop":
+                self._expired_ns.append(event.t_ns)
             elif event.code == EventCode.STALE_COMMAND:
                 held = bool(event.data) and msgspec.json.decode(event.data, type=StreamEnd).held
                 self._stale[event.source] = event.t_ns, held
@@ -144,7 +148,9 @@ class SteeringHistory:
         now = [one for one in self._commands if until_ns is None or one.t_ns < until_ns]
         part = replace(log, cycles=self._cycles, events=tuple(self._events), commands=tuple(now))
         for one in client_commands(part):
+            self._expire_pauses(one.command.t_ns)
             self._add(one)
+        self._expire_pauses(until_ns)
         self._last = now[-1] if now else self._last
         if until_ns is not None:
             self._commands = [one for one in self._commands if one.t_ns >= until_ns]
@@ -164,14 +170,21 @@ class SteeringHistory:
         kind = command.kind if command.for_loop and not one.refusal else ""
         if kind == "pause" and self._since is None:
             self._since = command.cycle, self._due_ns(command.cycle)
-        elif kind == "resume" and self._since is not None:
+        elif kind == "resume":
             self._pause(command.cycle)
-            self._since = None
+
+    def _expire_pauses(self, until_ns: int | None) -> None:
+        """End the pause that no client ended before a time (ns; None: any)."""
+        while self._expired_ns and (until_ns is None or self._expired_ns[0] < until_ns):
+            index = int(np.searchsorted(self._cycles["scheduled_ns"], self._expired_ns.pop(0), "right")) - 1
+            if index >= 0:
+                self._pause(int(self._cycles["cycle"][index]))
 
     def _pause(self, end: int) -> None:
+        """Add the current pause, if there is one, with its last cycle before `end`."""
         if self._since is None:
             return
-        begin, begin_ns = self._since
+        (begin, begin_ns), self._since = self._since, None
         start_ns = self._start_ns
         times = ((begin_ns - start_ns) / 1e9, (self._due_ns(end) - start_ns) / 1e9)
         self._pauses.append(Pause(*times, end - begin))
