@@ -18,6 +18,7 @@ from dxlrun.description.mistakes.words import Remedy, UnknownKeyContext
 from dxlrun.description.units import bound_text, example_of, units_of
 from dxlrun.errors import InputError, Mark, Problem, suggestion, what_and_fix
 from dxlrun.features import broken_features
+from dxlsim.texts.duration import split_quantity
 
 Form = TypeVar("Form", bound=BaseModel)
 
@@ -353,6 +354,7 @@ def format_value(value: object) -> str:
 
 
 _NUMBER = "a number"
+_WITH_UNIT = "a number with a unit"
 _WHOLE = "a whole number"
 _BOOL = "true or false"
 _TEXT = "text"
@@ -391,6 +393,7 @@ _BOUNDS: Mapping[str, str] = {
 _REMEDIES: Mapping[str, str] = {
     _WHOLE: "write digits only, without quotes or a decimal point",
     _NUMBER: "write a number without quotes",
+    _WITH_UNIT: "write the number without a unit",
     _BOOL: "write true or false without quotes (yes, no, on and off are text)",
     _TEXT: "put it in quotes",
     "a mapping": "write `key: value` lines below it, or {key: value, ...} after it",
@@ -426,6 +429,8 @@ def _remedy(error: _Error) -> str:
         return "remove the quotes" if expected != _WHOLE or isinstance(written, int) else _REMEDIES[_WHOLE]
     if expected == _TEXT and isinstance(error.input, bool | int | float):
         return f'put it in quotes: "{text_of(error.input)}"'
+    if isinstance(written, str) and expected in (_WHOLE, _NUMBER) and split_quantity(written):
+        expected = _WITH_UNIT
     return _example(error) or _REMEDIES.get(expected, "correct it")
 
 

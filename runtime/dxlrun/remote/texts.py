@@ -107,8 +107,7 @@ def value_not_finite(controller: str, kind: str, joint: str, value: object) -> s
 
 
 def quantities_of_joints(controller: str, quantities: Sequence[str]) -> str:
-    accepted = ", ".join(quantities) or "no values by name"
-    return f"{controller} accepts {accepted} for each joint"
+    return f"{controller} accepts {', '.join(quantities)} for each joint"
 
 
 def value_not_known(joint: str, quantity: str) -> str:

@@ -73,10 +73,12 @@ def send(
         seconds = None if in_ is None else duration(in_, bare="s") * 1e-9
     except ValueError as error:
         raise InputError(f"--in: {error}") from None
+    named = bool(words) and "=" not in words[0]
+    written = WrittenEntry.from_words(words[named:], file)  # before a robot is needed
     with connect_robot(chosen.robot, "send") as robot:
-        if words and "=" not in words[0]:
+        if named:
             words = (f"{_name_key(robot, controller, kind)}{words[0]}", *words[1:])
-        written = WrittenEntry.from_words(words, file)
+            written = WrittenEntry.from_words(words, file)
         try:
             with begun_or_cancelled(robot, "send", waited=wait):
                 done = robot.send(controller, kind, written.data, units=True, seconds=seconds, goal=wait)

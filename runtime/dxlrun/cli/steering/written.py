@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 from dxlrun.cli.inputs import parse_pair
@@ -18,6 +19,8 @@ from dxlrun.errors import DxlrunError, InputError, Problem, Refused
 _WORDS = "command line"
 _NEXT_KEY = re.compile(r"\s+(?=[^\W\d][\w.]*=)")
 """Space before the next pair of a word with several, such as "x=20cm y=0cm"."""
+_UNIT = re.compile(r"[A-Za-z°µ]{1,4}(?:/s(?:\^2)?)?|%")
+"""Unit that was written as a word of its own, after its number."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +41,9 @@ class WrittenEntry:
         if file is not None:
             text, name = read_text(file), str(file)
         else:
+            for word, unit in pairwise(words):
+                if word[-1:].isdigit() and "=" in word and _UNIT.fullmatch(unit):
+                    raise InputError(f"{unit!r} is not key=value; write {word}{unit} without the space")
             pairs = [pair for word in words for pair in _NEXT_KEY.split(word)]
             text, name = "\n".join(map(_line, pairs)) or "{}", _WORDS
         try:

@@ -166,7 +166,8 @@ def _command_for(known: ResolvedController, interface: str) -> tuple[str, tuple[
         if any(each in model.model_fields for model in commands.values())
         or (name == "position" and TRAJECTORY in commands)
     ]
-    hint = texts.quantities_of_joints(known.plan.name, offered)
+    name = known.plan.name
+    hint = texts.quantities_of_joints(name, offered) if offered else suggestion(interface, commands)
     fields_of: dict[str, Field] = {"controller": known.plan.name, "kind": interface, "known": tuple(commands)}
     raise refused(Code.UNKNOWN_COMMAND, fields_of | {"hint": hint})
 
