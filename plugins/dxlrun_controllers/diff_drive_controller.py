@@ -13,7 +13,7 @@ from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, TypeAdapter
+from pydantic import Field
 
 from dxlrun import (
     LIVE,
@@ -104,9 +104,9 @@ class DiffDriveParameters(ParametersModel):
 class VelocityCommand(CommandModel):
     """Twist of the base in the plane. It is valid until the next command, at most for the timeout."""
 
-    linear: Annotated[float, or_number(TypeAdapter(LinearVelocity))] = 0.0
+    linear: Annotated[float, or_number(LinearVelocity)] = 0.0
     """Forward velocity, m/s"""
-    angular: Annotated[float, or_number(TypeAdapter(AngularVelocity))] = 0.0
+    angular: Annotated[float, or_number(AngularVelocity)] = 0.0
     """Rate of turn, rad/s, positive to the left"""
 
 

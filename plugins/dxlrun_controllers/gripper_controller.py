@@ -155,9 +155,9 @@ class GripCommand(CommandModel):
 
     _unit: JointUnit | None = PrivateAttr(None)
     """Unit of the joint that the position was written for; None for a bare number"""
-    position: Annotated[float, or_number(TypeAdapter(Way))] | None = None
+    position: Annotated[float, or_number(Way)] | None = None
     """Goal position of the joint, rad, or m for a linear joint"""
-    width: Annotated[float, or_number(TypeAdapter(Length))] | None = None
+    width: Annotated[float, or_number(Length)] | None = None
     """Goal opening, m"""
     effort: Annotated[float, Field(gt=0)] | None = None
     """Effort limit on the way and at the goal, in the unit that the model measures"""

@@ -1,7 +1,5 @@
 """Group controllers: forward the newest command of one or two interfaces to a group of joints."""
 
-from __future__ import annotations
-
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np

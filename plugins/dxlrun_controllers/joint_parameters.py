@@ -2,14 +2,12 @@
 values.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Literal, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, BeforeValidator, Discriminator, Field, Tag, TypeAdapter
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, Tag, TypeAdapter
 
 from dxlrun import Context, Floats, Goal, Mistake, Outcome, ParametersModel, States, nearest_turn
 
@@ -35,8 +33,12 @@ def commanded_by(
             return (interface,)
 
 
-def or_number(adapter: TypeAdapter[float]) -> BeforeValidator:
-    """Return a validator that converts a text with a unit by `adapter` to SI; a number is SI already."""
+def or_number(quantity: object) -> BeforeValidator:
+    """Return a validator that converts a text with a unit of `quantity` to SI; a number is SI already."""
+    # Most runs get no text with a unit, and each validator takes time to build.
+    adapter: TypeAdapter[float] = TypeAdapter(
+        cast("type[float]", quantity), config=ConfigDict(defer_build=True)
+    )
     return BeforeValidator(lambda value: adapter.validate_python(value) if isinstance(value, str) else value)
 
 

@@ -23,7 +23,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import replace
 from importlib.util import find_spec
 from types import MappingProxyType
 
@@ -78,7 +77,7 @@ def told_once(problems: Iterable[Problem], names: Collection[str]) -> list[Probl
     return [
         first
         if not others
-        else replace(first, what=f"{first.what} (and {counted(len(others), 'joint', 'joints')} more)")
+        else first._replace(what=f"{first.what} (and {counted(len(others), 'joint', 'joints')} more)")
         for first, *others in found.values()
     ]
 

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 HELP = "https://example.org/dxlrun/how-to/it-does-not-work"
@@ -22,8 +21,8 @@ HELP = "https://example.org/dxlrun/how-to/it-does-not-work"
 pyproject.toml. A constant, because messages are also made in the loop, which reads no files."""
 
 
-@dataclass(frozen=True, slots=True, order=True)
-class Mark:
+# A dataclass takes longer to import, and every command imports this module.
+class Mark(NamedTuple):
     """Position in a file, printed as `file:line:column`, to which editors can jump; line and column count
     from 1."""
 
@@ -35,8 +34,7 @@ class Mark:
         return f"{self.file}:{self.line}:{self.column}"
 
 
-@dataclass(frozen=True, slots=True)
-class Problem:
+class Problem(NamedTuple):
     """One problem in an input file, with its position and the fix."""
 
     mark: Mark
@@ -95,7 +93,7 @@ class PortError(DxlError, OSError):
 FailureKind = Literal["no_reply", "refused", "torque_on", "not_written", "wrong_model", "unknown_model"]
 
 
-class ServoFailure(NamedTuple):  # A dataclass takes longer to import, and every command imports this module
+class ServoFailure(NamedTuple):
     """Failure of one servo: its kind, for programs, and a sentence for people."""
 
     kind: FailureKind

@@ -9,8 +9,6 @@ u s/e. Sources: K. J. Astrom, R. M. Murray, Feedback Systems (2008), sections 10
 B. Wittenmark, Computer-Controlled Systems (1997), section 8.
 """
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Tracking: PID law with feed-forward that makes joints follow a desired motion by velocities or efforts."""
 
-from __future__ import annotations
-
 from typing import Annotated, Final, Literal
 
 import numpy as np

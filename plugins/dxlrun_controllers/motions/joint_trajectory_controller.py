@@ -1,7 +1,5 @@
 """joint_trajectory_controller: move joints along a trajectory, whose desired state depends on the time."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from enum import Enum, auto, unique

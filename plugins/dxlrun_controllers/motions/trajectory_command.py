@@ -1,12 +1,10 @@
 """Commands of trajectories and chunks of positions, and their conversion to the flat arrays of the loop."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator, Mapping
 from typing import Annotated, Final, NamedTuple, Self
 
 import numpy as np
-from pydantic import BeforeValidator, Field, TypeAdapter, model_validator
+from pydantic import BeforeValidator, ConfigDict, Field, TypeAdapter, model_validator
 
 from dxlrun import CommandModel, Duration, Floats, RestSpeed, SpeedPeak, Tolerance
 from dxlrun_controllers.joint_parameters import check_size, or_number, row_of
@@ -24,7 +22,7 @@ SPLICED: Final = 2.0
 
 Without a splice it is 1; other joints have 0.
 """
-_DURATION: TypeAdapter[int] = TypeAdapter(Duration)
+_DURATION: TypeAdapter[int] = TypeAdapter(Duration, config=ConfigDict(defer_build=True))
 
 
 def _seconds(value: object) -> object:
@@ -35,9 +33,9 @@ def _seconds(value: object) -> object:
 Seconds = Annotated[float, BeforeValidator(_seconds), Field(ge=0)]
 
 
-Near = Annotated[float, Field(gt=0, allow_inf_nan=True), or_number(TypeAdapter(Tolerance))]
+Near = Annotated[float, Field(gt=0, allow_inf_nan=True), or_number(Tolerance)]
 """Position tolerance: rad or m, text with a unit, or `inf`"""
-Slow = Annotated[float, Field(gt=0, allow_inf_nan=True), or_number(TypeAdapter(RestSpeed))]
+Slow = Annotated[float, Field(gt=0, allow_inf_nan=True), or_number(RestSpeed)]
 """Velocity tolerance: rad/s or m/s, text with a unit, or `inf`"""
 
 

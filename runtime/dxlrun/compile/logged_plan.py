@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -53,7 +52,7 @@ def compile_texts(
                 return compile_robot(description, [])
         except InputError as error:
             problems = [
-                replace(one, mark=replace(one.mark, file=shorten(one.mark.file)), what=shorten(one.what))
+                one._replace(mark=one.mark._replace(file=shorten(one.mark.file)), what=shorten(one.what))
                 for one in error.problems
             ]
             raise InputError(problems or shorten(str(error))) from error

@@ -4,8 +4,6 @@ A value that consists of `${name}` alone has the argument's type: text if the de
 type that YAML reads. Inside longer text the argument is inserted as text. `$${` stands for a plain `${`.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from typing import Annotated

@@ -1,7 +1,5 @@
 """Form: base class of the pydantic models of all sections, types of names, and errors of validators."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from types import EllipsisType
@@ -77,7 +75,11 @@ ItemName = Annotated[
 
 
 class Form(BaseModel):
-    """Base of the models of all sections: frozen; unknown keys, infinities and wrong types are refused."""
+    """Base of the models of all sections: frozen; unknown keys, infinities and wrong types are refused.
+
+    Modules with forms that every robot file needs have no `from __future__ import annotations`, because
+    pydantic would compile the text of each annotation.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False, defer_build=True)
 

@@ -1,7 +1,5 @@
 """Bus: the form of one entry under `buses` of a robot file, a serial line."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Annotated, Literal

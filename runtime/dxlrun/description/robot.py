@@ -1,7 +1,5 @@
 """Robot: the form of a robot file, apart from the sections that features add."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from functools import cache
 from typing import Annotated, ClassVar, Literal

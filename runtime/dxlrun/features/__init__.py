@@ -122,7 +122,7 @@ def _build_form(form: object) -> None:
     # Imported here because most processes use no feature of a plug-in.
     from pydantic import TypeAdapter
 
-    TypeAdapter(cast("type[object]", type_of(form))).rebuild(force=True)
+    TypeAdapter(cast("type[object]", type_of(form))).rebuild()
 
 
 def _features_of(plugin: InstalledPlugin) -> Iterator[Feature]:

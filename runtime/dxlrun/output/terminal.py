@@ -11,7 +11,6 @@ import textwrap
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import replace
 from typing import IO, TYPE_CHECKING, TypeAlias, cast
 
 from dxlrun.output.escaping import escaped
@@ -221,15 +220,15 @@ def _cut(table: Table, width: int) -> Table | None:
             excess -= 1
     if excess > 0:
         return None
-    columns = tuple(replace(one, kind="name" if one.kind == "text" else one.kind) for one in table.columns)
+    columns = tuple(one._replace(kind="name" if one.kind == "text" else one.kind) for one in table.columns)
     rows = (
         tuple(
-            cell if len(cell.text) <= most else replace(cell, text=f"{cell.text[: most - 1].rstrip()}…")
+            cell if len(cell.text) <= most else cell._replace(text=f"{cell.text[: most - 1].rstrip()}…")
             for cell, most in zip(row, widths, strict=True)
         )
         for row in table.rows
     )
-    return replace(table, columns=columns, rows=tuple(rows))
+    return table._replace(columns=columns, rows=tuple(rows))
 
 
 def _width(table: Table, *, tight: bool) -> int:

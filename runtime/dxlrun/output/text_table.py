@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
 from itertools import compress
 from operator import attrgetter
-from typing import TYPE_CHECKING, Literal, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias, TypeVar
 
 from dxlrun.output.escaping import escaped
 
@@ -18,8 +17,7 @@ Kind = Literal["name", "number", "text"]
 Tone = Literal["plain", "good", "warning", "error"]
 
 
-@dataclass(frozen=True, slots=True)
-class Cell:
+class Cell(NamedTuple):
     """Text of a table's cell; its tone (good, warning, error) becomes a colour."""
 
     text: str
@@ -30,8 +28,7 @@ Value = Cell | str | float | None
 """Value for a cell before formatting (int included); None: an empty cell."""
 
 
-@dataclass(frozen=True, slots=True)
-class Column:
+class Column(NamedTuple):
     """Name of a column, and how its values are formatted and aligned."""
 
     name: str
@@ -55,8 +52,7 @@ Columns: TypeAlias = Sequence[tuple[Column, str | Callable[[T], Value]]]
 """Columns, each with the source of its values: an attribute or key of the row's object, or a function."""
 
 
-@dataclass(frozen=True, slots=True)
-class Table:
+class Table(NamedTuple):
     """A table: title, columns, and rows of cells. If columns have no names, the first names the rows."""
 
     title: str
@@ -86,8 +82,8 @@ class Table:
 
     def escaped(self) -> Table:
         """Return the table with control characters in all texts escaped."""
-        cells = (tuple(replace(cell, text=escaped(cell.text)) for cell in row) for row in self.rows)
-        columns = tuple(replace(column, name=escaped(column.name)) for column in self.columns)
+        cells = (tuple(cell._replace(text=escaped(cell.text)) for cell in row) for row in self.rows)
+        columns = tuple(column._replace(name=escaped(column.name)) for column in self.columns)
         return Table(escaped(self.title), columns, tuple(cells))
 
     def without_constants(self) -> tuple[str, Table]:
@@ -111,7 +107,7 @@ class Table:
 
     def _keeping(self, kept: Sequence[bool]) -> Table:
         columns = tuple(compress(self.columns, kept))
-        return replace(self, columns=columns, rows=tuple(tuple(compress(row, kept)) for row in self.rows))
+        return self._replace(columns=columns, rows=tuple(tuple(compress(row, kept)) for row in self.rows))
 
     def turned(self) -> Table:
         """Return a table with a row for each column, for rows that differ only in the first column."""
@@ -123,7 +119,7 @@ class Table:
         """Return the table with the error tone for the rows whose flag is True."""
         pairs = zip(self.rows, rows, strict=True)
         cells = (tuple(Cell(cell.text, "error") for cell in row) if bad else row for row, bad in pairs)
-        return replace(self, rows=tuple(cells))
+        return self._replace(rows=tuple(cells))
 
 
 def _value(thing: T, value: str | Callable[[T], Value]) -> Value:
@@ -133,8 +129,7 @@ def _value(thing: T, value: str | Callable[[T], Value]) -> Value:
     return found
 
 
-@dataclass(frozen=True, slots=True)
-class Sentence:
+class Sentence(NamedTuple):
     """A line of output, never wrapped, so that commands in it can be copied."""
 
     text: str

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import msgspec
 import numpy as np
@@ -263,7 +263,7 @@ def _check(part: _ControllerSamples, running: RunSnapshot, problems: Problems) -
 
 def _refused(warning: Problem) -> Problem:
     """Return a warning of the start-up check as an error: in a run, the loop would hold the joint instead."""
-    return replace(warning, severity="error", fix=what_and_fix(warning.fix)[1])
+    return warning._replace(severity="error", fix=what_and_fix(warning.fix)[1])
 
 
 def _way_ns(part: _ControllerSamples, running: RunSnapshot) -> int:

@@ -3,8 +3,6 @@
 `mechanics` describes how one or several servos move a joint.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterator, Mapping
@@ -291,7 +289,7 @@ def _planned(value: object) -> object:
     return float(value) if isinstance(value, float) else value
 
 
-_MEASURES: Mapping[KeyPath, tuple[AlternativeQuantity, Mapping[JointUnit, str]]] = {
+_MEASURES: Mapping["KeyPath", tuple[AlternativeQuantity, Mapping[JointUnit, str]]] = {
     ("limits", "position"): (position, {ROTARY: "[-90 deg, 90 deg]", LINEAR: "[0 mm, 40 mm]"}),
     ("limits", "velocity"): (speed, {ROTARY: "2 rad/s", LINEAR: "50 mm/s"}),
     ("limits", "acceleration"): (acceleration, {ROTARY: "20 rad/s^2", LINEAR: "500 mm/s^2"}),
@@ -303,7 +301,7 @@ _MEASURES: Mapping[KeyPath, tuple[AlternativeQuantity, Mapping[JointUnit, str]]]
     ("tolerance", "velocity"): (speed, {ROTARY: "2 deg/s", LINEAR: "2 mm/s"}),
 }
 """Keys whose unit must fit the kind of joint (angle or length), each with an example for both kinds."""
-_OF_OTHER_JOINTS: Mapping[JointUnit, Mapping[KeyPath, str]] = {
+_OF_OTHER_JOINTS: Mapping[JointUnit, Mapping["KeyPath", str]] = {
     ROTARY: {("simulation", "mass"): "write `inertia: 0.01 kg m^2`"},
     LINEAR: {
         ("gear_ratio",): "remove it; travel_per_turn replaces it",
@@ -314,7 +312,7 @@ _OF_OTHER_JOINTS: Mapping[JointUnit, Mapping[KeyPath, str]] = {
 """Keys that joints of this kind cannot have, each with a fix."""
 
 
-def misfits(joints: object) -> Iterator[tuple[KeyPath, str, str]]:
+def misfits(joints: object) -> Iterator[tuple["KeyPath", str, str]]:
     """Yield keys and units that do not fit a rotary or linear joint: path, problem, and fix.
 
     `joints` is the section of the file; the model checks its form.
@@ -358,13 +356,13 @@ def _quantities(form: object) -> Iterator[AlternativeQuantity]:
             yield from _quantities(part)
 
 
-def _written(entry: object, path: KeyPath) -> object:
+def _written(entry: object, path: "KeyPath") -> object:
     for step in path:
         entry = entry.get(step) if isinstance(entry, dict) else None
     return entry
 
 
-def _units(kind: AlternativeQuantity, value: object) -> Iterator[tuple[KeyPath, str]]:
+def _units(kind: AlternativeQuantity, value: object) -> Iterator[tuple["KeyPath", str]]:
     """Yield the SI units of a value or of the items of a list, with their index; skip unreadable ones."""
     places: list[tuple[KeyPath, object]] = [((), value)]
     if isinstance(value, list):

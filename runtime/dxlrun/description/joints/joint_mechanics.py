@@ -4,8 +4,6 @@ A servo's shaft turns by theta; s = direction * (theta - reference) * ratio is t
 joint. The position of a joint is q = s with one servo, and the mean of all s with several servos.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal

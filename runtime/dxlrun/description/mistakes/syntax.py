@@ -15,15 +15,17 @@ from dxlrun.errors import Mark, Problem
 
 _CLOSERS = {"{": "}", "[": "]"}
 _DEEPEST = 32  # levels; a text that is nested deeper is refused for that reason
-_KEY = re.compile(r"( *)(?:- +)*(?:[\w./-]+|\"[^\"]*\"|'[^']*') *:(?= |$)")
+# Most files have no such mistake, so these are compiled on first use.
+_KEY = r"( *)(?:- +)*(?:[\w./-]+|\"[^\"]*\"|'[^']*') *:(?= |$)"
 _NUMBER = r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?"
 _UNIT = r"(?:%|°|[A-Za-z]+(?:/[A-Za-z]+)?(?:\^\d)?)"
-_LIST_WITH_UNIT = re.compile(rf"([\[(])([^\[\](){{}}]*)[\])]\s*({_UNIT})(?=\s*(?:[,}}\]#]|$))")
-_RANGE = re.compile(
-    rf"[\[(]?\s*({_NUMBER})\s*({_UNIT})?\s*(?:,|;|\.\.+|to\b|\s)\s*({_NUMBER})\s*({_UNIT})?\s*[\])]?\s*({_UNIT})?"
+_LIST_WITH_UNIT = rf"([\[(])([^\[\](){{}}]*)[\])]\s*({_UNIT})(?=\s*(?:[,}}\]#]|$))"
+_RANGE = (
+    rf"[\[(]?\s*({_NUMBER})\s*({_UNIT})?\s*(?:,|;|\.\.+|to\b|\s)\s*"
+    rf"({_NUMBER})\s*({_UNIT})?\s*[\])]?\s*({_UNIT})?"
 )
-_MISSING_COLON = re.compile(r"^ *[A-Za-z][\w-]*( )[{\[]")
-_BLOCK_SCALAR = re.compile(r"(?:^|[ :-])[|>][-+0-9]*\s*$")
+_MISSING_COLON = r"^ *[A-Za-z][\w-]*( )[{\[]"
+_BLOCK_SCALAR = r"(?:^|[ :-])[|>][-+0-9]*\s*$"
 
 
 class _OpenQuoteError(Exception):
@@ -47,7 +49,7 @@ def explain_syntax(text: str, file: str) -> list[Problem]:
 
 def list_text(text: str) -> str:
     """Rewrite a range as a YAML list: `[-90 deg, 90 deg]` for `-90..90 deg`; empty if it is not a range."""
-    match = _RANGE.fullmatch(text.strip())
+    match = re.fullmatch(_RANGE, text.strip())
     if match is None:
         return ""
     unit = match[5] or match[4] or match[2]
@@ -63,7 +65,7 @@ def _unit(unit: str | None) -> str:
 
 def _units_behind_lists(lines: list[str], file: str) -> Iterator[Problem]:
     for number, line in enumerate(lines, 1):
-        for match in _LIST_WITH_UNIT.finditer(line.partition(" #")[0]):
+        for match in re.finditer(_LIST_WITH_UNIT, line.partition(" #")[0]):
             items = [item.strip() for item in match[2].split(",")]
             if not all(re.fullmatch(_NUMBER, item) for item in items):
                 continue
@@ -77,7 +79,7 @@ def _units_behind_lists(lines: list[str], file: str) -> Iterator[Problem]:
 
 def _missing_colons(lines: list[str], file: str) -> Iterator[Problem]:
     for number, line in enumerate(lines, 1):
-        if match := _MISSING_COLON.search(line):
+        if match := re.search(_MISSING_COLON, line):
             mark = Mark(file, number, match.start(1) + 1)
             yield Problem(mark, "a colon is missing before this", "write `key: value`")
 
@@ -147,8 +149,8 @@ def _structure(lines: list[str]) -> Iterator[tuple[int, int, str, str]]:
         indentation = len(line) - len(line.lstrip(" "))
         if block is not None and (not line.strip() or indentation > block):
             continue
-        block = indentation if _BLOCK_SCALAR.search(line) else None
-        if not quote and (key := _KEY.match(line)):
+        block = indentation if re.search(_BLOCK_SCALAR, line) else None
+        if not quote and (key := re.match(_KEY, line)):
             yield number, len(key[1]), "", ""
         escaped, before = False, ""
         for column, character in enumerate(line):

@@ -9,10 +9,10 @@ in failures.md.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from statistics import median
 from typing import TypeAlias
 
 import msgspec
+import numpy as np
 
 from dxlrun.channels.cycle import Commands
 from dxlrun.channels.event_records import EventSink
@@ -209,7 +209,7 @@ class StartUp:
         for plan, times in zip(self._plans, self._times, strict=True):
             late_ns = times.late_ns
             # Use the median: a few late replies may be due to the machine's load.
-            usual_ns = median(late_ns) if len(late_ns) >= _SOME else 0.0
+            usual_ns = float(np.median(late_ns)) if len(late_ns) >= _SOME else 0.0
             if usual_ns > plan.latency_ns + TIMEOUT_MARGIN_NS:
                 observed = describe_late_start(plan.name, plan.port, late_ns, plan.latency_ns)
                 yield f"the loop would miss most replies: {observed}"

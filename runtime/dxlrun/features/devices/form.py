@@ -1,7 +1,5 @@
 """Form of the section `devices` of a robot file: nodes on a servo bus that are not servos."""
 
-from __future__ import annotations
-
 import math
 import re
 from typing import Annotated

@@ -1,7 +1,5 @@
 """Form of the section `transmissions` of a robot file: several servos that move several joints together."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Annotated, Literal
 

@@ -1,7 +1,5 @@
 """Form of the section `recording` of a robot file."""
 
-from __future__ import annotations
-
 from dxlrun.description.base_form import Form, key
 from dxlrun.description.units import SizeOrDuration
 from dxlrun.features.feature import Section

@@ -1,7 +1,5 @@
 """Form of the section `sensors` of a robot file; the keys of each type are checked by its plug-in."""
 
-from __future__ import annotations
-
 from typing import Annotated, Literal
 
 from pydantic import Field
