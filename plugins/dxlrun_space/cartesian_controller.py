@@ -35,7 +35,7 @@ from dxlrun import (
     RobotModel,
 )
 from dxlrun.tooling.robots import FrameTree, Transform, read_urdf, rotated
-from dxlrun_space.chain import BASE, Chain, Vector, WrongChain, shifted
+from dxlrun_space.chain import BASE, Chain, Vector, WrongChain
 from dxlrun_space.path import (
     MotionLimits,
     NoPath,
@@ -46,18 +46,9 @@ from dxlrun_space.path import (
     plan_line,
     plan_positions,
 )
-from dxlrun_space.solver import FULL, Solver, distance, finish_search, residual_of
-from dxlrun_space.space_goals import (
-    POSES,
-    TWISTS,
-    PoseCommand,
-    PoseGoal,
-    TwistCommand,
-    TwistGoal,
-    packed,
-    unpacked,
-)
-from dxlrun_space.stream import TwistMotion, approach
+from dxlrun_space.solver import FULL, Solver, residual_of
+from dxlrun_space.space_goals import PoseCommand, TwistCommand, packed, unpacked
+from dxlrun_space.stream import TipMotion
 
 ACCELERATION: Final = 20.0
 """Acceleration of joints without a limit, rad/s^2; an XM430 stops from its highest speed in 0.25 s."""
@@ -67,16 +58,11 @@ STEP_NS: Final = 300_000
 """Period that pays for one step of planning: a step takes 0.05 ms, so planning takes 17 % of a cycle."""
 MOST_STEPS: Final = 50
 """Most steps of a cycle, 2.5 ms."""
-FEEDBACK_NS: Final = 100_000_000
-"""Time between two feedback messages of a goal, ns."""
-LEASH_M: Final = 0.02
-"""Longest distance of the pose that moves toward a leader from what is in reach, m: the way back is short."""
 _LONGEST_STOP_S: Final = 2.0
-_ZERO: Final[Vector] = (0.0, 0.0, 0.0)
 Twist: TypeAlias = "tuple[Vector, Vector]"
-NO_TWIST: Final[Twist] = (_ZERO, _ZERO)
+NO_TWIST: Final[Twist] = (BASE.translation, BASE.translation)
 Task: TypeAlias = "Generator[None, None, None]"
-"""Motion or planning that advances by a cycle with each `next`."""
+"""Motion that advances by a cycle, or planning by a step, with each `next`."""
 
 
 class TranslationLimits(ParametersModel):
@@ -167,7 +153,7 @@ class CartesianController(Controller[CartesianParameters]):
 
     A motion is planned as a whole before it begins, some steps in each cycle, so what is out of reach is
     refused while the joints are still at rest. A new goal first brakes the old motion on its path. A twist
-    that leads to a limit of a joint, or to a singularity, becomes slower.
+    moves a pose that the tip follows, and that stays near what is in reach.
     """
 
     Parameters = CartesianParameters
@@ -220,9 +206,12 @@ class CartesianController(Controller[CartesianParameters]):
         """Return a pose or a twist as one flat array. Raises ValueError if the tip follows a leader."""
         if parameters.leader is not None:
             raise ValueError(f"the tip follows a leader; a {kind} is not accepted")
-        if isinstance(command, PoseCommand | TwistCommand):
-            return packed(command.as_goal(parameters.joints))
-        return super().prepare(kind, command, parameters)
+        if isinstance(command, PoseCommand) and command.pose is not None:
+            if lacking := [joint for joint in parameters.joints if joint not in command.pose]:
+                raise ValueError(f"the pose has no position of {', '.join(lacking)}; name a pose of this arm")
+            own = {joint: command.pose[joint] for joint in parameters.joints}
+            command = command.model_copy(update={"pose": own})
+        return packed(command)
 
     @classmethod
     def check_command(
@@ -238,51 +227,47 @@ class CartesianController(Controller[CartesianParameters]):
     def on_configure(self, context: Context) -> None:
         """Build the chain, and everything that the loop needs."""
         super().on_configure(context)
-        parameters, limits = self.parameters, context.limits
+        parameters, limits, joints = self.parameters, context.limits, context.joints
         urdf, leader = read_urdf(context.urdf or ""), parameters.leader
-        self._chain = Chain(urdf, parameters.base, parameters.tip, context.joints)
+        self._chain = Chain(urdf, parameters.base, parameters.tip, joints)
         self._leader = None if leader is None else Chain(urdf, leader.base, leader.tip, leader.joints)
         self._others = [name.partition("/")[0] for name in context.read_names[: len(context.reads) // 2]]
         self._position, self._age = context.reads.reshape(2, -1)
         """Positions and ages of the leader's joints, or of the others."""
-        self._frames = FrameTree(urdf, (*context.joints, *self._others))
-        lower, upper = limits.lower.tolist(), limits.upper.tolist()
+        self._frames = FrameTree(urdf, (*joints, *self._others))
         self._limits = MotionLimits(
-            tuple(np.where(np.isnan(limits.velocity), SPEED, limits.velocity).tolist()),
-            tuple(np.where(np.isnan(limits.acceleration), ACCELERATION, limits.acceleration).tolist()),
+            tuple(np.nan_to_num(limits.velocity, nan=SPEED).tolist()),
+            tuple(np.nan_to_num(limits.acceleration, nan=ACCELERATION).tolist()),
             parameters.linear.velocity,
             parameters.linear.acceleration,
             parameters.angular.velocity,
             parameters.angular.acceleration,
         )
-        posture = parameters.posture
-        self._solver = Solver(self._chain, lower, upper, [posture.get(joint) for joint in context.joints])
+        posture = [parameters.posture.get(joint) for joint in joints]
+        self._solver = Solver(self._chain, limits.lower.tolist(), limits.upper.tolist(), posture)
         self._exact = parameters.orientation == "exact" or (
-            parameters.orientation is None and len(context.joints) >= FULL
+            parameters.orientation is None and len(joints) >= FULL
         )
-        self._stream = TwistMotion(self._solver, self._limits, exact=self._exact)
         self._steps = min(MOST_STEPS, max(1, context.period_ns // STEP_NS))
+        self._motion = TipMotion(self._solver, self._limits, exact=self._exact, steps=self._steps // 2 + 2)
         self._at: Positions = ()
         """Commanded positions, rad; empty while a joint has not answered yet."""
         self._now_ns, self._period_s = 0, context.period_ns * 1e-9
+        for command in (PoseCommand, TwistCommand):
+            command.model_rebuild()  # otherwise by the first one in the loop, which takes milliseconds
         self._forget()
 
     def _forget(self) -> None:
         self._task: Task | None = None
         self._moves = self._brakes = self._is_trying = False
         self._goal: Goal | None = None
-        self._waiting: PoseGoal | None = None
+        self._waiting: PoseCommand | None = None
         self._is_cancelled = False
         self._target: Transform | None = None
-        self._feedback_ns = self._commanded_ns = 0
+        self._commanded_ns = 0
         self._twist = NO_TWIST
         self._turns_with_tip = False
         self._is_held = self._is_ignoring = False
-        self._followed: Transform | None = None
-        """Pose that moves toward the leader's."""
-        self._sought: Positions = ()
-        """Positions of the followed pose, which the joints approach."""
-        self._stream.drop_twist()
 
     def on_activate(self, time_ns: int) -> None:
         """Hold the joints at their last goals."""
@@ -306,24 +291,24 @@ class CartesianController(Controller[CartesianParameters]):
 
     def on_goal(self, goal: Goal, data: NDArray[np.float64], time_ns: int) -> None:
         """Plan a motion to the pose; a motion that is under way brakes first."""
-        self._goal, self._is_cancelled, self._feedback_ns = goal, False, time_ns + FEEDBACK_NS
+        self._goal, self._is_cancelled = goal, False
         if joint := "" if self._at else self._hold_joints():
             self._end(Outcome.ABORTED, f"joint {joint} has not answered yet")
         else:
-            self._pass_to(unpacked(data, POSES))
+            self._pass_to(unpacked(data, PoseCommand))
 
     def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
         """Follow a twist; a pose that is under way ends as preempted. Or plan without moving."""
         if kind == "twist":
             if self._at or not self._hold_joints():
-                self._follow(unpacked(data, TWISTS), time_ns)
+                self._follow_twist(unpacked(data, TwistCommand), time_ns)
         elif self._moves or self._goal is not None:
             self._publish("the arm moves; ask again when it rests")
         else:
             self._drop_plan("replaced by a newer request")
-            self._task, self._is_trying = self._try(unpacked(data, POSES)), True
+            self._task, self._is_trying = self._try(unpacked(data, PoseCommand)), True
 
-    def _follow(self, twist: TwistGoal, time_ns: int) -> None:
+    def _follow_twist(self, twist: TwistCommand, time_ns: int) -> None:
         self._turns_with_tip = twist.frame == self._chain.tip
         try:
             rotation = (BASE if self._turns_with_tip else self._pose_of(twist.frame)).rotation
@@ -335,7 +320,8 @@ class CartesianController(Controller[CartesianParameters]):
         self._is_ignoring, self._commanded_ns = False, time_ns
         if self._goal is not None:
             self._end(Outcome.PREEMPTED, "replaced by a twist")
-        self._pass_to(None, (rotated(rotation, twist.linear), rotated(rotation, twist.angular)))
+        linear, angular = twist.twist
+        self._pass_to(None, (rotated(rotation, linear), rotated(rotation, angular)))
 
     def on_hold(self, time_ns: int) -> None:
         """Brake from the twist: the stream has ended."""
@@ -347,7 +333,7 @@ class CartesianController(Controller[CartesianParameters]):
         self._is_cancelled = True
         self._pass_to(None)
 
-    def _pass_to(self, pose: PoseGoal | None, twist: Twist = NO_TWIST) -> None:
+    def _pass_to(self, pose: PoseCommand | None, twist: Twist = NO_TWIST) -> None:
         """Brake on the path, then pursue a pose or a twist; at once if the tip rests."""
         self._waiting, self._twist, self._brakes = pose, twist, True
         if not self._moves:
@@ -401,10 +387,15 @@ class CartesianController(Controller[CartesianParameters]):
             self._hold_joints()
         elif self.context.states.has_lost and (self._leader or self._task):
             self._abandon()
-        elif self._leader is not None:
-            self._follow_leader(self._leader)
-        elif self._task is not None and next(self._task, True):
-            self._begin_task()
+        elif self._leader is not None and self._task is None:
+            self._task, self._moves = self._follow_leader(self._leader), True
+        elif self._task is not None:
+            for _ in range(self._steps):
+                has_ended = next(self._task, True)
+                if has_ended or self._moves:
+                    break
+            if has_ended:
+                self._begin_task()
         self._write()
 
     def _abandon(self) -> None:
@@ -418,37 +409,29 @@ class CartesianController(Controller[CartesianParameters]):
         self._end(Outcome.ABORTED, text)
         self._forget()
 
-    def _planned(self, asked: PoseGoal) -> Planning:
-        """Plan a motion from rest, some steps in each cycle."""
+    def _planned(self, asked: PoseCommand) -> Planning:
+        """Plan a motion from rest."""
         try:
             frame = self._pose_of(asked.frame)
         except (LookupError, ValueError) as error:
             return NoPath(str(error))
         solver, exact = self._solver, self._exact and asked.asks_orientation
         at, limits = self._at, self._limits
-        if asked.positions:
-            self._target = self._chain.pose(asked.positions)
-            planning = plan_positions(solver, at, asked.positions, self._target, limits)
+        if asked.pose is not None:
+            positions = tuple(asked.pose.values())
+            self._target = self._chain.pose(positions)
+            planning = plan_positions(solver, at, positions, self._target, limits)
         else:
             self._target = asked.target(frame, self._chain.pose(at))
-            plan = plan_line if asked.by_line else plan_joints
+            plan = plan_line if asked.path == "line" else plan_joints
             planning = plan(solver, at, self._target, limits, exact=exact)
-        found: Path | NoPath | None = None
-        while found is None:
-            for _ in range(self._steps):
-                try:
-                    next(planning)
-                except StopIteration as done:
-                    found = done.value
-                    break
-            else:
-                yield
-        if isinstance(found, Path) and asked.seconds < found.duration_s:
+        found = yield from planning
+        if isinstance(found, Path) and asked.seconds is not None and asked.seconds < found.duration_s:
             needed = math.ceil(found.duration_s * 100) / 100
             return NoPath(f"the motion takes {needed:.2f} s within its limits; ask for at least this time")
         return found
 
-    def _try(self, asked: PoseGoal) -> Task:
+    def _try(self, asked: PoseCommand) -> Task:
         """Plan a motion from rest to a pose, and publish it."""
         found = yield from self._planned(asked)
         self._is_trying = False
@@ -468,7 +451,7 @@ class CartesianController(Controller[CartesianParameters]):
         last = np.array(positions or (math.nan,) * len(self.context.joints))
         self.context.publish("plan", PosePlan(x, y, z, last, seconds, text))
 
-    def _pursue(self, asked: PoseGoal) -> Task:
+    def _pursue(self, asked: PoseCommand) -> Task:
         """Plan a motion to a pose, make it, and let the runtime judge the goal at the end of the path.
 
         The time of the path passes more slowly while the tip brakes.
@@ -477,21 +460,20 @@ class CartesianController(Controller[CartesianParameters]):
         if isinstance(path, NoPath):
             self._end(Outcome.ABORTED, path.text)
             return
+        self._moves = True
         yield
         stretch, passed_s, rate, slope = 1.0, 0.0, 1.0, 0.0
-        if path.duration_s > 0 and not math.isnan(asked.seconds):
+        if path.duration_s > 0 and asked.seconds is not None:
             stretch = path.duration_s / asked.seconds
-        self._moves = True
         while True:
             if self._brakes and not slope:
-                slope = self._braking(path.sample(passed_s).velocities, stretch)
+                slope = self._braking(path.sample(passed_s)[1], stretch)
             before, rate = rate, max(0.0, rate - slope * self._period_s)
             passed_s += (before + rate) / 2 * stretch * self._period_s
-            self._at = path.sample(passed_s).positions
+            self._at, _ = path.sample(passed_s)
             if rate == 0.0 or passed_s >= path.duration_s:
                 break
-            if self._goal is not None and not slope and self._now_ns >= self._feedback_ns:
-                self._feedback_ns = self._now_ns + FEEDBACK_NS
+            if self._goal is not None and not slope:
                 error = float(np.abs(self.context.states.position - self._at).max())
                 self._goal.feedback(passed_s / path.duration_s, error)
             yield
@@ -511,17 +493,19 @@ class CartesianController(Controller[CartesianParameters]):
 
     def _stream_twists(self) -> Task:
         """Move at the twist until it is 0 and the tip rests."""
+        motion = self._motion
+        motion.begin_motion(self._at)
         while True:
             if self._now_ns - self._commanded_ns > self.parameters.timeout:
                 self._twist = NO_TWIST
             linear, angular = self._twist
             if self._turns_with_tip:
-                rotation = self._chain.pose(self._at).rotation
-                linear, angular = rotated(rotation, linear), rotated(rotation, angular)
-            self._at = self._stream.advance_joints(self._at, linear, angular, self._period_s)
-            held = self._stream.held_by
+                turn = motion.pose.rotation
+                linear, angular = rotated(turn, linear), rotated(turn, angular)
+            self._at = motion.advance_joints(linear, angular, self._period_s)
+            held = motion.held_by
             self._report_hold("" if held < 0 else f"held: joint {self.context.joints[held]} is at its limit")
-            if self._stream.rests and not (any(linear) or any(angular)):
+            if motion.rests and not (any(linear) or any(angular)):
                 return
             yield
 
@@ -531,42 +515,24 @@ class CartesianController(Controller[CartesianParameters]):
             self.context.say(text)
         self._is_held = bool(text)
 
-    def _follow_leader(self, chain: Chain) -> None:
-        """Move the followed pose toward that of the leader within the limits in space, and solve it."""
-        begin, period_s = self._followed or self._chain.pose(self._at), self._period_s
-        linear = angular = _ZERO
-        # NaN of a joint that has not answered yet counts as the oldest.
-        oldest = int(self._age.argmax())
-        silence, leader = self._silence(oldest), self.parameters.leader
-        if leader is not None and not silence:
-            lead = chain.pose(self._position.tolist())
-            x, y, z = (leader.scale * a + b for a, b in zip(lead.translation, leader.offset, strict=True))
-            way, turn = distance(begin, Transform((x, y, z), lead.rotation))
-            linear = approach(way, self._limits.linear_acceleration, period_s)
-            angular = approach(turn, self._limits.angular_acceleration, period_s)
-        self._report_hold(silence and f"no reply from leader {chain.joints[oldest]} {silence}, holding")
-        self._stream.change_twist(linear, angular, period_s)
-        (a, b, c), (u, v, w) = self._stream.linear, self._stream.angular
-        self._followed = shifted(
-            begin, (a * period_s, b * period_s, c * period_s), (u * period_s, v * period_s, w * period_s)
-        )
-        sought = self._sought or self._at
-        found = finish_search(
-            self._solver.search_from(self._followed, sought, exact=self._exact, steps=self._steps // 2 + 2)
-        )
-        if (left := found.residual.position) > LEASH_M:
-            way, _ = distance(self._followed, self._chain.pose(found.positions))
-            share = 1 - LEASH_M / left
-            self._followed = shifted(self._followed, (way[0] * share, way[1] * share, way[2] * share), _ZERO)
-        rows = zip(found.positions, sought, self._at, self._limits.acceleration, strict=True)
-        speeds = [
-            (goal - before) / period_s + approach((before - now, 0.0, 0.0), most, period_s)[0]
-            for goal, before, now, most in rows
-        ]
-        self._at, self._sought = self._stream.turn_joints(self._at, speeds, period_s), found.positions
+    def _follow_leader(self, chain: Chain) -> Task:
+        """Move the tip toward the pose of the leader while the leader answers."""
+        leader, motion = self.parameters.leader, self._motion
+        motion.begin_motion(self._at)
+        while leader is not None:
+            twist, oldest = NO_TWIST, int(self._age.argmax())  # NaN, of no answer yet, counts as the oldest.
+            silence = self._silence(oldest)
+            if not silence:
+                lead = chain.pose(self._position.tolist())
+                x, y, z = (leader.scale * a + b for a, b in zip(lead.translation, leader.offset, strict=True))
+                goal = Transform((x, y, z), lead.rotation)
+                twist = motion.twist_to(goal, self._period_s)
+            self._report_hold(silence and f"no reply from leader {chain.joints[oldest]} {silence}, holding")
+            self._at = motion.advance_joints(*twist, self._period_s)
+            yield
 
 
-def _remark(path: Path, asked: PoseGoal) -> str:
+def _remark(path: Path, asked: PoseCommand) -> str:
     """Return what is not reached at the end of a path; empty if all is."""
     if not asked.asks_orientation or path.residual.is_close:
         return ""

@@ -36,10 +36,11 @@ class WrongChain(ValueError):
 
 
 class _JointStep(msgspec.Struct, frozen=True):
-    """One joint: its index in the positions, and its frame, whose z axis it has, in the one before it."""
+    """One joint: its index in the positions, and its frame in the one before it."""
 
     index: int
     fixed: Transform
+    axis: Vector
     slides: bool
 
 
@@ -68,9 +69,9 @@ class Chain:
         for joint in ways:
             before = before @ Transform(joint.xyz, from_rpy(joint.rpy))
             if joint.moves:
-                onto = Transform(rotation=_onto(joint.axis))
-                steps.append(_JointStep(joints.index(joint.name), before @ onto, joint.type == "prismatic"))
-                before = onto.inverse
+                index, slides = joints.index(joint.name), joint.type == "prismatic"
+                steps.append(_JointStep(index, before, joint.axis, slides))
+                before = BASE
         self._steps, self._end = tuple(steps), before
         parts = *(step.fixed for step in steps[1:]), self._end
         self.length = max(0.01, math.fsum(math.hypot(*part.translation) for part in parts))
@@ -86,20 +87,13 @@ class Chain:
         for step in self._steps:
             u, v, w = rotated(turn, step.fixed.translation)
             x, y, z = x + u, y + v, z + w
-            a, b, c, d = turn = product(turn, step.fixed.rotation)
+            turn = product(turn, step.fixed.rotation)
+            u, v, w = axis = rotated(turn, step.axis)
             position = positions[step.index]
-            # The joint turns about its z axis, or moves along it.
-            u, v, w = axis = 2 * (a * c + b * d), 2 * (b * c - a * d), 1 - 2 * (a * a + b * b)
             if step.slides:
                 x, y, z = x + u * position, y + v * position, z + w * position
             else:
-                sine, cosine = math.sin(position / 2), math.cos(position / 2)
-                turn = (
-                    a * cosine + b * sine,
-                    b * cosine - a * sine,
-                    c * cosine + d * sine,
-                    d * cosine - c * sine,
-                )
+                turn = product(turn, rotation_about(step.axis, position))
             self._axes[step.index], self._origins[step.index] = axis, (x, y, z)
         tip = Transform((x, y, z), turn) @ self._end
         self._tip_at = tip.translation
@@ -120,13 +114,6 @@ class Chain:
                 p, q, r = x - u, y - v, z - w
                 columns.append((b * r - c * q, c * p - a * r, a * q - b * p, a * lever, b * lever, c * lever))
         return columns
-
-    def without_turns(self, positions: Sequence[float]) -> tuple[float, ...]:
-        """Return the positions with angles of at most half a turn, which have the same pose."""
-        return tuple(
-            each if slides else math.remainder(each, math.tau)
-            for each, slides in zip(positions, self._slides, strict=True)
-        )
 
 
 def _ways(urdf: Urdf, base: str, tip: str) -> list[UrdfJoint]:
@@ -180,11 +167,16 @@ def spread(lower: Sequence[float], upper: Sequence[float], count: int) -> Floats
     return positions
 
 
+def scaled(vector: Vector, scale: float) -> Vector:
+    """Return a multiple of a vector."""
+    x, y, z = vector
+    return x * scale, y * scale, z * scale
+
+
 def shifted(pose: Transform, way: Vector, turn: Vector) -> Transform:
     """Return a pose that is moved, and turned by a rotation vector, in the axes of its parent."""
-    angle, (x, y, z), (u, v, w), (a, b, c) = math.hypot(*turn), pose.translation, way, turn
-    scale = 1 / max(angle, _LEAST_SINE)
-    rotation = rotation_about((a * scale, b * scale, c * scale), angle)
+    angle, (x, y, z), (u, v, w) = math.hypot(*turn), pose.translation, way
+    rotation = rotation_about(scaled(turn, 1 / max(angle, _LEAST_SINE)), angle)
     return Transform((x + u, y + v, z + w), product(rotation, pose.rotation))
 
 
@@ -195,12 +187,3 @@ def rotation_vector(rotation: Quaternion) -> Vector:
     scale = 2 * math.atan2(sine, abs(w)) / sine if sine > _LEAST_SINE else 2.0
     scale = math.copysign(scale, w)  # the quaternion with the other sign is the same rotation
     return x * scale, y * scale, z * scale
-
-
-def _onto(axis: Vector) -> Quaternion:
-    """Return a rotation that turns the z axis onto a unit vector."""
-    x, y, z = axis
-    if z < -0.999999:
-        return 1.0, 0.0, 0.0, 0.0
-    length = math.hypot(x, y, 1 + z)
-    return -y / length, x / length, 0.0, (1 + z) / length

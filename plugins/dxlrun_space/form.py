@@ -9,7 +9,7 @@ from pydantic import AfterValidator, Field, model_validator
 from dxlrun import Angle, Length
 from dxlrun.tooling.features import Section
 from dxlrun.tooling.files import Form, Name, key
-from dxlrun_space.space_goals import PoseCommand, PoseGoal, at_most_a_turn, check_turns
+from dxlrun_space.space_goals import PoseCommand, at_most_a_turn, check_turns
 
 _Place = Annotated[Length, Field(ge=-100, le=100)]  # As in the command `pose`
 _Turn = Annotated[Angle, AfterValidator(at_most_a_turn)]
@@ -38,10 +38,9 @@ class TipPose(Form):
         check_turns(self.quaternion, self.rpy)
         return self
 
-    def as_goal(self) -> PoseGoal:
-        """Return the pose as a goal."""
-        fields = self.model_dump(include={"x", "y", "z", "rpy", "quaternion"})
-        return PoseCommand.model_validate(fields).as_goal()
+    def as_command(self) -> PoseCommand:
+        """Return the pose as a command."""
+        return PoseCommand.model_validate(self.model_dump(include={"x", "y", "z", "rpy", "quaternion"}))
 
 
 STAGE: Section[dict[str, TipPose]] = Section(

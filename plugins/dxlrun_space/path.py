@@ -18,7 +18,7 @@ import numpy as np
 
 from dxlrun import Floats
 from dxlrun.tooling.robots import Transform
-from dxlrun_space.chain import shifted
+from dxlrun_space.chain import scaled, shifted
 from dxlrun_space.solver import CLOSE_M, Residual, Solver, distance, residual_of
 
 Positions = tuple[float, ...]
@@ -37,8 +37,6 @@ _BEND_RAD: Final = 0.002
 nodes are closer, because a spline would leave the line by 1 mm."""
 _MARGIN: Final = 0.8
 """Part of the jump and bend limits that the next node is planned for."""
-_LEASH_RAD: Final = 0.05
-"""Largest change of a joint toward the posture between two nodes, rad or m."""
 _SHARE: Final = 0.5
 """Part of a joint's acceleration limit for each of two terms: the path's curvature, and changes of speed."""
 _TIP_SHARE: Final = 0.7
@@ -65,69 +63,45 @@ class NoPath(msgspec.Struct, frozen=True):
     text: str
 
 
-class Sample(msgspec.Struct, frozen=True):
-    """Positions and velocities of the joints on a path, rad and rad/s."""
-
-    positions: Positions
-    velocities: Positions
-
-
 class Path:
-    """Nodes of a motion with the time of each.
+    """Nodes of a motion with the time of each, joined by cubic Hermite splines of the time.
 
     Args:
-        places: Place of each node on the path, 0 to 1.
-        nodes: Joint positions of each node, rad or m.
-        slopes: Derivative of the positions by the place at each node.
         times: Time of each node, s.
-        speeds: Speed of the place at each node, 1/s.
+        nodes: Joint positions of each node, rad or m.
+        velocities: Velocities of the joints at each node.
         residual: Distance of the last node from the pose that was asked.
         solver: Its limits are those of the joints; a start outside of them is not changed.
     """
 
     def __init__(
-        self,
-        places: Sequence[float],
-        nodes: Sequence[Positions],
-        slopes: Sequence[Sequence[float]],
-        times: Sequence[float],
-        speeds: Sequence[float],
-        *,
-        residual: Residual,
-        solver: Solver,
+        self, times: Sequence[float], nodes: Floats, velocities: Floats, residual: Residual, solver: Solver
     ) -> None:
-        self._places, self._times, self._speeds = places, times, speeds
-        self._nodes, self._slopes = nodes, slopes
-        self._lower = [*map(min, solver.lower, nodes[0])]
-        self._upper = [*map(max, solver.upper, nodes[0])]
+        self._times, self._nodes, self._velocities = times, nodes, velocities
+        self._lower, self._upper = np.minimum(solver.lower, nodes[0]), np.maximum(solver.upper, nodes[0])
         self.residual = residual
         self.duration_s = times[-1]
 
     @property
     def last(self) -> Positions:
         """Positions at the end of the path."""
-        return self._nodes[-1]
+        return tuple(self._nodes[-1].tolist())
 
-    def sample(self, time_s: float) -> Sample:
-        """Return positions and velocities at a time since the start, s."""
-        if not 0.0 < time_s < self.duration_s:
-            return Sample(self._nodes[-1 if time_s >= self.duration_s else 0], (0.0,) * len(self.last))
-        index = bisect_right(self._times, time_s) - 1
-        passed, speed = time_s - self._times[index], self._speeds[index]
-        slope = (self._speeds[index + 1] - speed) / (self._times[index + 1] - self._times[index])
-        way = self._places[index + 1] - self._places[index]
-        share = min(1.0, (speed + slope * passed / 2) * passed / way)
-        rate = (speed + slope * passed) / way
-        positions, velocities = [], []
-        ends = *self._nodes[index : index + 2], *self._slopes[index : index + 2]
-        # A cubic Hermite spline. Between a node at a limit and the next one, it would pass the limit.
-        for a, b, m, n, lower, upper in zip(*ends, self._lower, self._upper, strict=True):
-            leaving, entering = m * way, n * way
-            bend, twist = 3 * (b - a) - 2 * leaving - entering, leaving + entering - 2 * (b - a)
-            position = a + share * (leaving + share * (bend + share * twist))
-            positions.append(min(max(position, lower), upper))
-            velocities.append((leaving + share * (2 * bend + 3 * share * twist)) * rate)
-        return Sample(tuple(positions), tuple(velocities))
+    def sample(self, time_s: float) -> tuple[Positions, Positions]:
+        """Return positions and velocities of the joints at a time since the start, s."""
+        index = min(bisect_right(self._times, max(time_s, 0.0)), len(self._times) - 1)
+        (a, b), (m, n) = self._nodes[index - 1 : index + 1], self._velocities[index - 1 : index + 1]
+        begin, end = self._times[index - 1 : index + 1]
+        if time_s >= end:  # after the last node
+            return self.last, (0.0,) * len(b)
+        span = end - begin
+        share, leaving, entering = max(time_s - begin, 0.0) / span, m * span, n * span
+        bend, twist = 3 * (b - a) - 2 * leaving - entering, leaving + entering - 2 * (b - a)
+        positions = a + share * (leaving + share * (bend + share * twist))
+        velocities = (leaving + share * (2 * bend + 3 * share * twist)) / span
+        # Between a node at a limit and the next one, the spline would pass the limit.
+        within = np.minimum(np.maximum(positions, self._lower), self._upper)
+        return tuple(within.tolist()), tuple(velocities.tolist())
 
 
 Planning = Generator[None, None, Path | NoPath]
@@ -151,11 +125,11 @@ def plan_positions(
     for joint, at, low, high in zip(solver.chain.joints, goal, solver.lower, solver.upper, strict=True):
         if not low - _ROUNDING <= at <= high + _ROUNDING:
             return NoPath(f"the pose has {joint} outside its limits")
-    ways = [b - a for a, b in zip(start, goal, strict=True)]
-    count = _count(max(map(abs, ways)) / _NODE_RAD)
-    places = [index / count for index in range(count + 1)]
-    nodes = [tuple(a + place * way for a, way in zip(start, ways, strict=True)) for place in places[:-1]]
-    return (yield from _timed(solver, places, [*nodes, goal], target, limits))
+    count = _count(max(abs(b - a) for a, b in zip(start, goal, strict=True)) / _NODE_RAD)
+    places = np.arange(count + 1) / count
+    nodes = np.array(start) + places[:, None] * (np.array(goal) - start)
+    nodes[-1] = goal
+    return (yield from _timed(solver, places, nodes, target, limits))
 
 
 def plan_line(
@@ -167,35 +141,30 @@ def plan_line(
     if not suffices(found.residual, exact):
         return NoPath(out_of_reach(found.residual, exact))
     begin = solver.chain.pose(start)
-    (x, y, z), (u, v, w) = distance(begin, target)
-    length = math.hypot(x, y, z)
-    count = _count(max(length / _NODE_M, math.hypot(u, v, w) / _NODE_RAD))
-    places, nodes = [0.0], [start]
-    step = 1.0 / count
+    way, turn = distance(begin, target)
+    length = math.hypot(*way)
+    longest = 1.0 / _count(max(length / _NODE_M, math.hypot(*turn) / _NODE_RAD))
+    places, nodes, step = [0.0], [start], longest
     while places[-1] < 1.0:
         place = places[-1] + step
-        here = target
-        if place < 1.0 - _LEAST:
-            here = shifted(begin, (x * place, y * place, z * place), (u * place, v * place, w * place))
-        else:
-            place = 1.0
-        guess = _guess(places, nodes, place)
-        found = yield from solver.search_from(here, guess, exact=exact, leash=_LEASH_RAD)
+        place = 1.0 if place > 1.0 - _LEAST else place
+        here = shifted(begin, scaled(way, place), scaled(turn, place))
+        found = yield from solver.search_from(here, _guess(places, nodes, place), exact=exact)
         effort = _effort([*places[-2:], place], [*nodes[-2:], found.positions])
         is_solved = suffices(found.residual, exact)
         if is_solved and effort <= 1.0:
             places.append(place)
             nodes.append(found.positions)
-        elif step * count <= 0.5**_SPLITS or len(nodes) >= _MOST_SPLIT:
+        elif step <= longest * 0.5**_SPLITS or len(nodes) >= _MOST_SPLIT:
             passed, whole = places[-1] * length * 1e3, length * 1e3
             return NoPath(
                 f"the straight line ends after {passed:.0f} of {whole:.0f} mm, at a limit of a joint or "
                 "where a joint would leap; write path=joints"
             )
         factor = min(2.0, max(0.25, _MARGIN / max(effort, _LEAST))) if is_solved else 0.5
-        step = min(max(step * factor, 0.5**_SPLITS / count), 1.0 / count)
+        step = min(max(step * factor, longest * 0.5**_SPLITS), longest)
         yield
-    return (yield from _timed(solver, places, nodes, target, limits))
+    return (yield from _timed(solver, np.array(places), np.array(nodes), target, limits))
 
 
 def out_of_reach(residual: Residual, exact: bool) -> str:
@@ -235,21 +204,17 @@ def _effort(places: Sequence[float], nodes: Sequence[Positions]) -> float:
 
 
 def _timed(
-    solver: Solver,
-    places: Sequence[float],
-    nodes: Sequence[Positions],
-    target: Transform,
-    limits: MotionLimits,
+    solver: Solver, places: Floats, nodes: Floats, target: Transform, limits: MotionLimits
 ) -> Planning:
     """Give each node its time."""
     poses: list[Transform] = []
-    for node in nodes:
+    for node in nodes.tolist():
         poses.append(solver.chain.pose(node))
         if len(poses) % 3 == 0:  # as long as a step of a search
             yield
     ways = np.diff(places)
-    slopes = _slopes(ways, np.array(nodes))
-    tops, gains = _bounds(ways, np.array(nodes), slopes, poses, limits)
+    slopes = np.gradient(nodes, places, axis=0)
+    tops, gains = _bounds(ways, nodes, slopes, poses, limits)
     yield
     speeds = [0.0, *tops, 0.0]
     # Forward, no node is passed faster than the acceleration before it allows; backward, than braking does.
@@ -257,20 +222,11 @@ def _timed(
         speeds[index + 1] = min(speeds[index + 1], math.sqrt(speeds[index] ** 2 + gain))
     for index, gain in reversed([*enumerate(gains)]):
         speeds[index] = min(speeds[index], math.sqrt(speeds[index + 1] ** 2 + gain))
-    if np.abs(slopes).max() < _LEAST:
-        times = speeds = [0.0] * len(nodes)
-    else:
+    times = [0.0] * len(nodes)
+    if np.abs(slopes).max() >= _LEAST:
         pairs = zip(ways.tolist(), speeds, speeds[1:], strict=False)
         times = [*accumulate((2 * way / (a + b) for way, a, b in pairs), initial=0.0)]
-    residual = residual_of(poses[-1], target)
-    return Path(places, nodes, slopes.tolist(), times, speeds, residual=residual, solver=solver)
-
-
-def _slopes(ways: Floats, nodes: Floats) -> Floats:
-    """Return the derivative of the positions by the place at each node, from its two neighbours."""
-    chords = np.diff(nodes, axis=0) / ways[:, None]
-    share = (ways[1:] / (ways[:-1] + ways[1:]))[:, None]
-    return np.concatenate((chords[:1], share * chords[:-1] + (1 - share) * chords[1:], chords[-1:]))
+    return Path(times, nodes, slopes * np.array(speeds)[:, None], residual_of(poses[-1], target), solver)
 
 
 def _bounds(

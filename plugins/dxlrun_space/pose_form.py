@@ -36,7 +36,7 @@ def solve_pose(pose: TipPose, chain: Chain, joints: Mapping[str, JointPlan]) -> 
     near = [pose.near.get(joint) for joint in chain.joints]
     solver = Solver(chain, [plan.lower for plan in plans], [plan.upper for plan in plans], near)
     start = tuple(each or 0.0 for each in near)
-    goal = pose.as_goal()
+    goal = pose.as_command()
     exact = goal.asks_orientation and len(plans) >= FULL
     target = goal.target(BASE, chain.pose(start))
     search = (

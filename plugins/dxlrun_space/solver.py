@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 
 from dxlrun.tooling.robots import Transform, conjugate, product
-from dxlrun_space.chain import Chain, Column, Vector, rotation_vector, spread
+from dxlrun_space.chain import Chain, Column, Vector, rotation_vector, scaled, spread
 
 EXACT: Final = 0.3
 """Lever of the orientation where it must be reached."""
@@ -31,42 +31,32 @@ CLOSE_RAD: Final = 2e-4
 """Orientation error of a solution, rad."""
 STEPS: Final = 20
 """Steps per start of a search."""
-SAMPLES: Final = 1000
+SAMPLES: Final = 2000
 """Positions whose poses are known beforehand. A search begins at those with the nearest poses."""
-FIRST_STARTS: Final = 16
-"""Starts for position and orientation at the nearest samples, enough for 99.9 % of the poses in reach."""
-LAST_START: Final = 208
-START_STRIDE: Final = 3
-"""Each third of the samples up to the last start: neighbours lead to the same solution."""
-PLACES: Final = 16
-"""Starts for the position alone. Where the arm is folded, limits keep some of them from a place in reach."""
-FIRST_PLACES: Final = 6
-"""Starts for a position beyond `_FAR`."""
-_FAR: Final = 0.2
-"""Position error, as a fraction of the length, beyond which a position is surely out of reach."""
+STARTS: Final = 160
+"""Starts for position and orientation; of 10,000 poses in reach of six joints, one needed 116."""
+PLACES: Final = 3
+"""Starts for the position alone."""
 _NEAR: Final = 0.05
 """Position error, as a fraction of the length, within which orientations are tried."""
-_ALIKE: Final = 0.01
-"""Difference of all joints below which two starts lead to one solution, rad or m."""
 _FAILING: Final = 0.8
 """A start is given up when two steps together do not reduce the cost to this fraction."""
-_STALLING: Final = 1 - 1e-5
-"""Ratio of two costs beyond which the nearest pose is found."""
-_STALLING_PLACE: Final = 1 - 1e-6
-"""The same of the nearest position, which is reported: the rest is 0.1 mm in 1 m."""
+_STALLING: Final = 1 - 1e-6
+"""Ratio of two costs beyond which the nearest pose is found: the rest of its distance is 0.1 mm in 1 m."""
 _POSTURE: Final = 1e-5
 """Lever of the distance from the posture."""
 _PULL: Final = 0.02
 """Lever of the posture of an arm with more joints than a pose needs."""
+_LEASH: Final = 0.05
+"""Largest distance in which the posture attracts a joint without a leap, rad or m."""
 _LONGEST_STEP: Final = 1.0
 """Largest change of a joint in a step, rad or m: the linear model is not valid for more."""
 _STILL: Final = 1e-7
 """Change of all joints below which a search has converged, rad or m."""
-_DAMPING: Final = (1e-3, 1e-7, 1e-12, 1e3)
-"""First damping, that of a start near the solution, smallest, and largest: parts of the squared length."""
+_DAMPING: Final = (1e-3, 1e-7, 1e-12)
+"""First damping, that of a start near the solution, and smallest: parts of the squared length."""
 FULL: Final = 6
 """Degrees of freedom of a pose. Fewer joints lack orientations, and more leave a choice."""
-_UNLIMITED: Final = (-math.inf, math.inf)
 
 
 class Residual(msgspec.Struct, frozen=True):
@@ -145,7 +135,6 @@ class Solver:
     ) -> None:
         self.chain = chain
         self.lower, self.upper = tuple(lower), tuple(upper)
-        self._limits = tuple(zip(lower, upper, strict=True))
         self._posture = tuple(posture) or (None,) * len(chain.joints)
         self._redundant = len(chain.joints) > FULL and any(each is not None for each in self._posture)
         self._tendency = (_POSTURE * chain.length) ** 2
@@ -155,8 +144,8 @@ class Solver:
         ).T.copy()
         """Position and quaternion of each sample, one column each."""
 
-    def _nearest(self, target: Transform, lever: float) -> list[tuple[float, ...]]:
-        """Return the samples by the distance of their poses, the nearest first.
+    def _nearest(self, target: Transform, lever: float, count: int) -> list[tuple[float, ...]]:
+        """Return the samples with the nearest poses.
 
         Sums and products of single elements only, which are the same on each processor.
         """
@@ -165,7 +154,7 @@ class Solver:
         far = (x - a) ** 2 + (y - b) ** 2 + (z - c) ** 2
         alike = sum(one * other for one, other in zip(turn, target.rotation, strict=True))
         far -= (2 * lever * self.chain.length * alike) ** 2
-        return [self._samples[index] for index in far.argsort(kind="stable").tolist()]
+        return [self._samples[index] for index in far.argsort(kind="stable")[:count].tolist()]
 
     def search(self, target: Transform, start: Sequence[float], *, exact: bool) -> Search:
         """Search from several starts; the first is `start`. The best solution is returned.
@@ -177,46 +166,27 @@ class Solver:
             place = yield from self.search_place(target, best.positions)
             if place.residual.position > _NEAR * self.chain.length:
                 return (yield from self.search_from(target, place.positions, exact=False))
-            best = yield from self._search_samples(target, best, exact)
+            best = yield from self._try_starts(target, best, EXACT, STARTS)
             if not exact and not best.residual.is_close:
-                place = min(place, best, key=lambda one: one.residual.position)
-                best = yield from self.search_from(target, place.positions, exact=False, steps=2 * STEPS)
+                best = yield from self.search_from(target, best.positions, exact=False)
+                if best.residual.position > max(CLOSE_M, place.residual.position):
+                    best = yield from self.search_from(target, place.positions, exact=False)
         if self._redundant:
-            best = yield from self.search_from(target, best.positions, exact=True)
+            best = yield from self.search_from(target, best.positions, exact=True, leash=math.inf)
         return best
 
     def search_place(self, target: Transform, start: Sequence[float]) -> Search:
         """Search for the nearest position, with any orientation."""
-        best = yield from self._descend(target, start, 0.0)
-        for number, each in enumerate(self._nearest(target, 0.0)[:PLACES]):
-            far = best.residual.position
-            if far <= CLOSE_M or (number >= FIRST_PLACES and far > _FAR * self.chain.length):
-                break
-            found = yield from self._descend(target, each, 0.0, 2 * STEPS)
-            best = min(best, found, key=lambda one: one.residual.position)
-        return (yield from self._descend(target, best.positions, 0.0, 5 * STEPS))
+        best = yield from self._descend(target, start, 0.0, is_patient=False)
+        return (yield from self._try_starts(target, best, 0.0, PLACES))
 
-    def _search_samples(self, target: Transform, best: Solution, exact: bool) -> Search:
-        def rank(one: Solution) -> tuple[float, float]:
-            return _rank(one.residual, exact)
-
-        tried: list[tuple[float, ...]] = []
-        nearest = self._nearest(target, EXACT)
-        for each in nearest[:FIRST_STARTS] + nearest[FIRST_STARTS:LAST_START:START_STRIDE]:
-            # Limits stop most descents early, so the way may pass them. Whole turns back, its end is a start.
-            free = yield from self._descend(target, each, EXACT, is_patient=False, is_limited=False)
-            back = self.chain.without_turns(free.positions)
-            miss = free.residual.position + 0.1 * free.residual.orientation
-            if rank(free) >= rank(best) and miss > _NEAR * self.chain.length:
-                continue
-            if any(_apart(back, one) < _ALIKE for one in tried):
-                continue
-            tried.append(back)
-            found = yield from self._descend(target, back, EXACT, is_patient=False)
-            best = min(best, found, key=rank)
-            if best.residual.is_close:
+    def _try_starts(self, target: Transform, best: Solution, lever: float, count: int) -> Search:
+        for each in self._nearest(target, lever, count):
+            if best.residual.is_close if lever else best.residual.position <= CLOSE_M:
                 return best
-        return (yield from self._descend(target, best.positions, EXACT, 2 * STEPS))
+            found = yield from self._descend(target, each, lever, is_patient=False)
+            best = min(best, found, key=lambda one: one.cost)
+        return (yield from self._descend(target, best.positions, lever, 5 * STEPS))
 
     def search_from(
         self,
@@ -225,7 +195,7 @@ class Solver:
         *,
         exact: bool,
         steps: int = STEPS,
-        leash: float = math.inf,
+        leash: float = _LEASH,
     ) -> Search:
         """Search from one start, without a leap to another solution.
 
@@ -257,14 +227,11 @@ class Solver:
         leash: float = math.inf,
         *,
         is_patient: bool = True,
-        is_limited: bool = True,
     ) -> Search:
         scale = self.chain.length
-        limits = self._limits if is_limited else (_UNLIMITED,) * len(self._limits)
-        stalling = _STALLING if lever else _STALLING_PLACE
-        first, near, least, most = (each * scale * scale for each in _DAMPING)
+        first, near, least = (each * scale * scale for each in _DAMPING)
         damping = near if is_patient else first
-        now = _inside(start, limits)
+        now = self._inside(start)
         posture = [
             a if b is None else min(max(b, a - leash), a + leash)
             for a, b in zip(now, self._posture, strict=True)
@@ -276,19 +243,17 @@ class Solver:
                 break
             if lever == 0.0 and best.residual.position <= CLOSE_M / 20:
                 break
-            change = self._step(best, damping, limits)
-            trial = _inside([a + b for a, b in zip(best.positions, change, strict=True)], limits)
-            if _apart(trial, best.positions) < _STILL:
+            change = self._step(best, damping)
+            trial = self._inside([a + b for a, b in zip(best.positions, change, strict=True)])
+            if max(abs(a - b) for a, b in zip(trial, best.positions, strict=True)) < _STILL:
                 break
             yield
             tried = self._estimate(target, trial, posture, lever * scale)
             if tried.cost < best.cost:
-                is_still = tried.cost > stalling * best.cost
+                is_still = tried.cost > _STALLING * best.cost
                 best, damping = tried, max(least, damping * 0.1)
                 if is_still:
                     break
-            elif damping >= most:
-                break
             else:
                 damping = max(damping, 1e-9 * scale * scale) * 5
             if not is_patient and best.cost > _FAILING * before and not best.residual.is_close:
@@ -303,18 +268,19 @@ class Solver:
         way, turn = distance(self.chain.pose(positions), target)
         columns, tendency = self.chain.jacobian(lever), self._tendency
         ways = [b - a for a, b in zip(positions, posture, strict=True)]
-        pulled = pulls(columns, way, turn, lever)
-        gradient = [pull + tendency * each for pull, each in zip(pulled, ways, strict=True)]
+        (x, y, z), (u, v, w) = way, scaled(turn, lever)
+        gradient = [
+            a * x + b * y + c * z + d * u + e * v + f * w + tendency * each
+            for (a, b, c, d, e, f), each in zip(columns, ways, strict=True)
+        ]
         far, off = math.hypot(*way), math.hypot(*turn)
         cost = far * far + (lever * off) ** 2 + tendency * math.fsum(map(mul, ways, ways))
         return Solution(positions, Residual(far, off), cost, gradient, columns)
 
-    def _step(self, model: Solution, damping: float, limits: _Limits) -> list[float]:
+    def _step(self, model: Solution, damping: float) -> list[float]:
         """Return the change of the joints that minimizes the model; joints at a limit do not move outward."""
-        free = [
-            not (now >= upper if slope > 0 else now <= lower)
-            for slope, now, (lower, upper) in zip(model.gradient, model.positions, limits, strict=True)
-        ]
+        rows = zip(model.gradient, model.positions, self.lower, self.upper, strict=True)
+        free = [not (now >= upper if slope > 0 else now <= lower) for slope, now, lower, upper in rows]
         columns = [*compress(model.columns, free)]
         solved = solve(normal_matrix(columns, damping + self._tendency), [*compress(model.gradient, free)])
         longest = max(map(abs, solved), default=0.0)
@@ -322,30 +288,8 @@ class Solver:
         moves = iter(solved)
         return [next(moves) * scale if each else 0.0 for each in free]
 
-
-_Limits = Sequence[tuple[float, float]]
-
-
-def _inside(positions: Sequence[float], limits: _Limits) -> tuple[float, ...]:
-    return tuple(min(max(each, low), high) for each, (low, high) in zip(positions, limits, strict=True))
-
-
-def _apart(one: Sequence[float], other: Sequence[float]) -> float:
-    """Return the largest difference of a joint, rad or m."""
-    return max(abs(a - b) for a, b in zip(one, other, strict=True))
-
-
-def _rank(residual: Residual, exact: bool) -> tuple[float, float]:
-    """Return the order of solutions: position first unless `exact`, where one rad counts as 0.1 m."""
-    if exact:
-        return residual.position + 0.1 * residual.orientation, 0.0
-    return max(residual.position, CLOSE_M), residual.orientation
-
-
-def pulls(columns: Sequence[Column], way: Vector, turn: Vector, lever: float) -> list[float]:
-    """Return J^T e of an error or a twist of the tip, by the columns of a Jacobian with the same lever."""
-    (x, y, z), (u, v, w) = way, (turn[0] * lever, turn[1] * lever, turn[2] * lever)
-    return [a * x + b * y + c * z + d * u + e * v + f * w for a, b, c, d, e, f in columns]
+    def _inside(self, positions: Sequence[float]) -> tuple[float, ...]:
+        return tuple(map(min, map(max, positions, self.lower), self.upper))
 
 
 def normal_matrix(columns: Sequence[Column], damping: float) -> list[list[float]]:

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Annotated, Final, Literal, Self, TypeVar
 
-import msgspec
 import numpy as np
 from pydantic import BeforeValidator, Field, TypeAdapter, model_validator
 
 from dxlrun import NAMED_POSE, Angle, AngularVelocity, CommandModel, Floats, Length, LinearVelocity
 from dxlrun.tooling.robots import Transform, from_rpy, product
-from dxlrun_space.chain import Quaternion, Vector
+from dxlrun_space.chain import Vector
 
 NORM: Final = 1e-3
 """Largest difference of a quaternion's length from 1: three decimals of each number."""
-T = TypeVar("T")
+C = TypeVar("C", bound=CommandModel)
 
 
 def _si(adapter: TypeAdapter[float]) -> BeforeValidator:
@@ -108,26 +107,28 @@ class PoseCommand(CommandModel):
         check_turns(self.quaternion, self.rpy, self.drpy)
         return self
 
-    def as_goal(self, joints: Sequence[str] = ()) -> PoseGoal:
-        """Return the pose for the loop; raise ValueError if a pose by name lacks one of the joints."""
-        if self.pose is not None and (lacking := [each for each in joints if each not in self.pose]):
-            raise ValueError(f"the pose has no position of {', '.join(lacking)}; name a pose of this arm")
-        x, y, z = (math.nan if each is None else each for each in (self.x, self.y, self.z))
-        rotation = None if self.rpy is None else from_rpy(self.rpy)
-        if self.quaternion is not None:
-            length = math.hypot(*self.quaternion)
-            a, b, c, d = self.quaternion
-            rotation = a / length, b / length, c / length, d / length
-        return PoseGoal(
-            (x, y, z),
-            (self.dx or 0.0, self.dy or 0.0, self.dz or 0.0),
-            rotation,
-            from_rpy(self.drpy or (0.0, 0.0, 0.0)),
-            self.path == "line",
-            math.nan if self.seconds is None else self.seconds,
-            self.frame,
-            tuple(self.pose[joint] for joint in joints) if self.pose else (),
+    @property
+    def asks_orientation(self) -> bool:
+        """True if the pose has an orientation, absolute or relative."""
+        return any(each is not None for each in (self.rpy, self.drpy, self.quaternion))
+
+    def target(self, frame: Transform, tip: Transform) -> Transform:
+        """Return the goal pose in the base from the poses of the frame and of the tip at the start."""
+        present = frame.inverse @ tip
+        goals, ways = (self.x, self.y, self.z), (self.dx or 0.0, self.dy or 0.0, self.dz or 0.0)
+        a, b, c = (
+            (now if goal is None else goal) + way
+            for now, goal, way in zip(present.translation, goals, ways, strict=True)
         )
+        rotation = present.rotation
+        if self.rpy is not None:
+            rotation = from_rpy(self.rpy)
+        elif self.drpy is not None:
+            rotation = product(from_rpy(self.drpy), rotation)
+        elif self.quaternion is not None:
+            length, (x, y, z, w) = math.hypot(*self.quaternion), self.quaternion
+            rotation = x / length, y / length, z / length, w / length
+        return frame @ Transform((a, b, c), rotation)
 
 
 class TwistCommand(CommandModel):
@@ -144,57 +145,17 @@ class TwistCommand(CommandModel):
     frame: _Frame = ""
     """Link whose axes are meant; those of the tip turn with it. Empty: the base of the controller"""
 
-    def as_goal(self, joints: Sequence[str] = ()) -> TwistGoal:
-        """Return the twist for the loop."""
-        return TwistGoal((self.vx, self.vy, self.vz), (self.wx, self.wy, self.wz), self.frame)
-
-
-class PoseGoal(msgspec.Struct, frozen=True, array_like=True):
-    """A pose in the axes of a frame; NaN: not given."""
-
-    place: Vector
-    way: Vector
-    rotation: Quaternion | None
-    turn: Quaternion
-    by_line: bool
-    seconds: float
-    frame: str
-    positions: tuple[float, ...]
-    """Positions of the joints, rad or m; empty: by the coordinates."""
-
     @property
-    def asks_orientation(self) -> bool:
-        """True if the goal has an orientation, absolute or relative."""
-        return self.rotation is not None or self.turn[3] != 1.0
-
-    def target(self, frame: Transform, tip: Transform) -> Transform:
-        """Return the goal pose in the base from the poses of the frame and of the tip at the start."""
-        present = frame.inverse @ tip
-        a, b, c = (
-            (now if math.isnan(goal) else goal) + way
-            for now, goal, way in zip(present.translation, self.place, self.way, strict=True)
-        )
-        rotation = present.rotation if self.rotation is None else self.rotation
-        return frame @ Transform((a, b, c), product(self.turn, rotation))
+    def twist(self) -> tuple[Vector, Vector]:
+        """Linear and angular velocity."""
+        return (self.vx, self.vy, self.vz), (self.wx, self.wy, self.wz)
 
 
-class TwistGoal(msgspec.Struct, frozen=True, array_like=True):
-    """A velocity of the tip in the axes of a frame, m/s and rad/s."""
-
-    linear: Vector
-    angular: Vector
-    frame: str
+def packed(command: CommandModel) -> Floats:
+    """Return a command as an array for the loop: one number per byte of its JSON."""
+    return np.frombuffer(command.model_dump_json(exclude_defaults=True).encode(), np.uint8).astype(np.float64)
 
 
-def packed(goal: PoseGoal | TwistGoal) -> Floats:
-    """Return a goal as an array for the loop: one number per byte."""
-    return np.frombuffer(msgspec.msgpack.encode(goal), np.uint8).astype(np.float64)
-
-
-def unpacked(data: Floats, decoder: msgspec.msgpack.Decoder[T]) -> T:
-    """Return the goal in an array of `packed`."""
-    return decoder.decode(data.astype(np.uint8).tobytes())
-
-
-POSES: Final = msgspec.msgpack.Decoder(PoseGoal)
-TWISTS: Final = msgspec.msgpack.Decoder(TwistGoal)
+def unpacked(data: Floats, kind: type[C]) -> C:
+    """Return the command in an array of `packed`."""
+    return kind.model_validate_json(data.astype(np.uint8).tobytes())

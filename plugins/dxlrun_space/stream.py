@@ -1,119 +1,114 @@
-"""Stream: joint velocities for a twist of the tip, cycle by cycle, within all limits.
-
-Damped least squares (C. W. Wampler, "Manipulator inverse kinematic solutions based on vector formulations and
-damped least-squares methods", 1986): near a singularity joints become slower instead of faster.
-"""
+"""Stream: joint positions, cycle by cycle, for a pose that moves at a twist or toward another pose."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Final
 
-from dxlrun_space.chain import Vector
-from dxlrun_space.path import MotionLimits
-from dxlrun_space.solver import EXACT, Solver, normal_matrix, pulls, solve
+from dxlrun.tooling.robots import Transform
+from dxlrun_space.chain import BASE, Vector, scaled, shifted
+from dxlrun_space.path import MotionLimits, Positions
+from dxlrun_space.solver import Solver, distance, finish_search
 
-_ORIENTATION: Final = 0.03
-"""Lever of the orientation for arms that cannot keep all its turns, as a fraction of the length."""
-_DAMPING: Final = 0.01
-"""Damping, as a fraction of the length: 1 % of a joint's lever slows a motion by one part in ten thousand."""
-_STUCK: Final = 0.02
-"""Fraction of the velocity below which a motion counts as held."""
-
+LEASH_M: Final = 0.02
+"""Longest distance of the moving pose from what is in reach, m: the way back is short."""
+LEASH_RAD: Final = 0.1
+"""The same of its orientation, rad."""
 _BRAKING: Final = 0.8
 """Part of the acceleration for a planned stop. The rest makes up for the length of a period."""
+_STILL: Final = 1e-6
+"""Speed below which a joint rests, rad/s or m/s."""
+_ZERO: Final[Vector] = (0.0, 0.0, 0.0)
 
 
-class TwistMotion:
-    """Motion of a chain by twists.
+class TipMotion:
+    """Motion of a tip by a velocity that changes at any time, within the limits of the tip and of the joints.
+
+    The limits of the tip are those of a pose, whose solution the joints approach within their own limits:
+    near a singularity they need longer.
 
     Args:
         solver: Solver with the chain and the limits of its joints.
         limits: Limits of joints and tip.
-        exact: The arm can keep the orientation, so it counts as much as the position.
+        exact: The orientation counts as much as the position.
+        steps: Most steps of a search for the joints of the pose.
     """
 
-    def __init__(self, solver: Solver, limits: MotionLimits, *, exact: bool) -> None:
-        self._solver, self._chain, self._limits = solver, solver.chain, limits
-        self._lever = (EXACT if exact else _ORIENTATION) * self._chain.length
-        self._damping = (_DAMPING * self._chain.length) ** 2
-        self.linear: Vector = (0.0, 0.0, 0.0)
-        """Present velocity of the tip, m/s, within its acceleration limit."""
-        self.angular: Vector = (0.0, 0.0, 0.0)
-        self._speeds = (0.0,) * len(self._chain.joints)
+    def __init__(self, solver: Solver, limits: MotionLimits, *, exact: bool, steps: int) -> None:
+        self._solver, self._limits, self._exact, self._steps = solver, limits, exact, steps
+        self.begin_motion(())
+
+    def begin_motion(self, positions: Positions) -> None:
+        """Begin at rest at joint positions."""
+        self._linear = self._angular = _ZERO
+        self._at = self._sought = positions
+        self._speeds = (0.0,) * len(positions)
+        self.pose = self._solver.chain.pose(positions) if positions else BASE
+        """Pose that moves."""
         self.held_by = -1
-        """Index of the joint that holds the tip at its limit, or -1."""
+        """Index of a joint that is at its limit while the pose is out of reach, or -1."""
 
     @property
     def rests(self) -> bool:
-        """True if neither the tip nor a joint is moved."""
-        return not any((*self.linear, *self.angular, *self._speeds))
+        """True if neither the pose nor a joint moves."""
+        return not any((*self._linear, *self._angular)) and max(map(abs, self._speeds)) < _STILL
 
-    def drop_twist(self) -> None:
-        """Set the velocity to 0 at once."""
-        self.linear = self.angular = (0.0, 0.0, 0.0)
-        self._speeds = (0.0,) * len(self._speeds)
+    def twist_to(self, goal: Transform, period_s: float) -> tuple[Vector, Vector]:
+        """Return the twist toward a pose, from which the motion can stop there."""
+        (way, turn), limits = distance(self.pose, goal), self._limits
+        far, off = math.hypot(*way), math.hypot(*turn)
+        linear = approach(far, limits.linear_acceleration, period_s) / max(far, 1e-12)
+        angular = approach(off, limits.angular_acceleration, period_s) / max(off, 1e-12)
+        return scaled(way, linear), scaled(turn, angular)
 
-    def change_twist(self, linear: Vector, angular: Vector, period_s: float) -> None:
-        """Bring the present velocity closer to a twist, within the limits of the tip."""
-        limits, rest = self._limits, (0.0, 0.0, 0.0)
-        linear, angular = (
-            _toward(rest, linear, limits.linear_velocity),
-            _toward(rest, angular, limits.angular_velocity),
-        )
-        self.linear = _toward(self.linear, linear, limits.linear_acceleration * period_s)
-        self.angular = _toward(self.angular, angular, limits.angular_acceleration * period_s)
+    def advance_joints(self, linear: Vector, angular: Vector, period_s: float) -> Positions:
+        """Return the joint positions after a period in which the velocity approaches a twist, m/s, rad/s."""
+        limits = self._limits
+        linear = _toward(_ZERO, linear, limits.linear_velocity)
+        angular = _toward(_ZERO, angular, limits.angular_velocity)
+        self._linear = _toward(self._linear, linear, limits.linear_acceleration * period_s)
+        self._angular = _toward(self._angular, angular, limits.angular_acceleration * period_s)
+        self.pose = shifted(self.pose, scaled(self._linear, period_s), scaled(self._angular, period_s))
+        before, solver = self._sought, self._solver
+        search = solver.search_from(self.pose, before, exact=self._exact, steps=self._steps)
+        found = finish_search(search)
+        self._sought, self.held_by = found.positions, -1
+        if found.residual.position > LEASH_M or found.residual.orientation > LEASH_RAD:
+            reached = solver.chain.pose(self._sought)
+            way, turn = distance(reached, self.pose)
+            self.pose = shifted(reached, _toward(_ZERO, way, LEASH_M), _toward(_ZERO, turn, LEASH_RAD))
+            ends = zip(self._sought, solver.lower, solver.upper, strict=True)
+            self.held_by = next((index for index, (at, *limit) in enumerate(ends) if at in limit), -1)
+        self._turn_joints(before, period_s)
+        return self._at
 
-    def advance_joints(
-        self, positions: Sequence[float], linear: Vector, angular: Vector, period_s: float
-    ) -> tuple[float, ...]:
-        """Return the joint positions after a period at the twist, which the present velocity approaches."""
-        self.change_twist(linear, angular, period_s)
-        self.held_by = -1
-        if self.rests:
-            return tuple(positions)
-        self._chain.pose(positions)
-        columns = self._chain.jacobian(self._lever)
-        right = pulls(columns, self.linear, self.angular, self._lever)
-        speeds = solve(normal_matrix(columns, self._damping), right)
-        return self.turn_joints(positions, speeds, period_s)
-
-    def turn_joints(
-        self, positions: Sequence[float], speeds: Sequence[float], period_s: float
-    ) -> tuple[float, ...]:
-        """Return the joint positions after a period at speeds that are limited, rad/s or m/s."""
-        self.held_by, scale = -1, 1.0
-        for index, (speed, now) in enumerate(zip(speeds, positions, strict=True)):
-            share = self._highest(index, now, speed, period_s) / max(abs(speed), 1e-12)
-            if share < scale:
-                scale = share
-                self.held_by = index if share < _STUCK else -1
+    def _turn_joints(self, before: Positions, period_s: float) -> None:
+        """Turn the joints toward the sought positions, and keep up with these."""
+        limits, solver = self._limits, self._solver
+        share, speeds = 1.0, list[float]()
+        for index, (now, then, goal) in enumerate(zip(self._at, before, self._sought, strict=True)):
+            most, rate = limits.velocity[index], limits.acceleration[index]
+            closing = math.copysign(approach(abs(then - now), rate, period_s), then - now)
+            speed = (goal - then) / period_s + closing
+            left = max(0.0, solver.upper[index] - now if speed > 0 else now - solver.lower[index])
+            # The speed at which the joint still stops at its limit.
+            most = min(most, math.sqrt(rate * left), left / period_s)
+            share = min(share, most / max(abs(speed), 1e-12))
+            speeds.append(speed)
         # Near a singularity the speeds change at once. The tip leaves its direction while the joints follow.
         self._speeds = tuple(
-            min(max(speed * scale, before - rate * period_s), before + rate * period_s)
-            for speed, before, rate in zip(speeds, self._speeds, self._limits.acceleration, strict=True)
+            min(max(speed * share, last - rate * period_s), last + rate * period_s)
+            for speed, last, rate in zip(speeds, self._speeds, limits.acceleration, strict=True)
         )
-        return tuple(now + speed * period_s for now, speed in zip(positions, self._speeds, strict=True))
-
-    def _highest(self, index: int, now: float, speed: float, period_s: float) -> float:
-        """Return the speed at which a joint still stops at its limit, at most its own limit."""
-        left = self._solver.upper[index] - now if speed > 0 else now - self._solver.lower[index]
-        if left <= 0:
-            return 0.0
-        brake = self._limits.acceleration[index] / 2
-        return min(self._limits.velocity[index], math.sqrt(2 * brake * left), left / period_s)
+        self._at = tuple(now + speed * period_s for now, speed in zip(self._at, self._speeds, strict=True))
 
 
-def approach(way: Vector, acceleration: float, period_s: float) -> Vector:
-    """Return the velocity toward a point that is `way` off, from which a motion can stop there."""
-    brake, length = _BRAKING * acceleration, math.hypot(*way)
-    # Near the point the velocity is proportional to the way, because a period is too long for more.
+def approach(way: float, acceleration: float, period_s: float) -> float:
+    """Return the speed toward a point that is `way` off, from which a motion can stop there."""
+    brake = _BRAKING * acceleration
+    # Near the point the speed is proportional to the way, because a period is too long for more.
     near = brake * (2 * period_s) ** 2
-    speed = length / (2 * period_s) if length < near else math.sqrt(2 * brake * (length - near / 2))
-    x, y, z = way
-    scale = speed / max(length, 1e-12)
-    return x * scale, y * scale, z * scale
+    return way / (2 * period_s) if way < near else math.sqrt(2 * brake * (way - near / 2))
 
 
 def _toward(now: Vector, goal: Vector, most: float) -> Vector:

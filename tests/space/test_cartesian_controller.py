@@ -207,7 +207,7 @@ def test_a_plan_is_published_and_moves_nothing() -> None:
     assert stage.goal.ended[0][0] == "reached"
     count = len(stage.messages)
     for _ in range(2):
-        stage.give("plan", x=0.9)  # sought in many cycles
+        stage.give("plan", rpy=(0, 0, 1.5), path="joints")  # sought in many cycles
         played(stage, 0.02)
     stage.send(None, "pose", dz=-0.05)
     texts = [plan.text for _, plan in stage.messages[count:]]
@@ -341,7 +341,7 @@ def test_a_twist_in_the_axes_of_the_tip_turns_with_it() -> None:
 
 @pytest.mark.parametrize("name", ["open_manipulator_x", "six"])
 def test_twists_into_singularities_and_limits_are_held(name: str) -> None:
-    """Out to the stretched arm, and on: within all limits, without a leap, and back again."""
+    """Out to the stretched arm, and on: within all limits, at rest there, and back again."""
     present = READY if name == "open_manipulator_x" else (0.2, -0.4, 0.8, 0.3, 0.6, -0.2)
     arm, stage = all_arms()[name], staged(name, present)
     rows = np.vstack(
@@ -349,7 +349,7 @@ def test_twists_into_singularities_and_limits_are_held(name: str) -> None:
     )
     assert_smooth(rows)
     assert all(arm.within(row) for row in rows)
-    assert np.abs(rows[-1] - rows[-2]).max() < 0.02
+    assert np.abs(np.diff(rows[180:200], axis=0)).max() < 2e-3, "stretched out, it rests"
 
 
 @pytest.mark.parametrize("name", ["open_manipulator_x", "koch", "six", "op3"])
@@ -379,7 +379,7 @@ def test_a_pose_follows_a_twist_and_a_twist_ends_a_pose() -> None:
     stage.cancel()
     stage.give("twist", vx=-0.05)
     rows += [*played(stage, 1.0)]
-    assert tip(stage)[0, 3] < all_arms()["open_manipulator_x"].matrix(rows[-51])[0, 3] - 1e-3
+    assert tip(stage)[0, 3] < all_arms()["open_manipulator_x"].matrix(rows[-51])[0, 3] - 5e-4
     assert_smooth(np.array(rows))
 
 
