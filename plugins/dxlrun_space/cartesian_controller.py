@@ -35,7 +35,7 @@ from dxlrun import (
     RobotModel,
 )
 from dxlrun.tooling.robots import FrameTree, Transform, read_urdf, rotated
-from dxlrun_space.chain import BASE, Chain, Vector, WrongChain
+from dxlrun_space.chain import BASE, Chain, Vector, WrongChain, shifted
 from dxlrun_space.path import (
     MotionLimits,
     NoPath,
@@ -46,7 +46,7 @@ from dxlrun_space.path import (
     plan_line,
     plan_positions,
 )
-from dxlrun_space.solver import FULL, Solver, residual_of
+from dxlrun_space.solver import FULL, Solver, distance, residual_of
 from dxlrun_space.space_goals import PoseCommand, TwistCommand, packed, unpacked
 from dxlrun_space.stream import TipMotion
 
@@ -96,6 +96,8 @@ class LeaderParameters(ParametersModel):
     """Factor on the position of the leader's tip."""
     offset: Annotated[tuple[Length, ...], Field(min_length=3, max_length=3)] = (0.0, 0.0, 0.0)
     """Offset added to the scaled position: x, y, z, m."""
+    relative: bool = False
+    """Follow the leader's motion from the poses of both tips at the activation; `offset` has no effect."""
 
 
 class CartesianParameters(ParametersModel):
@@ -519,13 +521,21 @@ class CartesianController(Controller[CartesianParameters]):
         """Move the tip toward the pose of the leader while the leader answers."""
         leader, motion = self.parameters.leader, self._motion
         motion.begin_motion(self._at)
+        anchor: tuple[Transform, Transform] | None = None
         while leader is not None:
             twist, oldest = NO_TWIST, int(self._age.argmax())  # NaN, of no answer yet, counts as the oldest.
             silence = self._silence(oldest)
-            if not silence:
+            if silence:
+                anchor = None
+            else:
                 lead = chain.pose(self._position.tolist())
                 x, y, z = (leader.scale * a + b for a, b in zip(lead.translation, leader.offset, strict=True))
                 goal = Transform((x, y, z), lead.rotation)
+                if leader.relative:
+                    # The motion since the activation, in the axes of the base.
+                    anchor = anchor or (goal, motion.pose)
+                    way, turn = distance(anchor[0], goal)
+                    goal = shifted(anchor[1], way, turn)
                 twist = motion.twist_to(goal, self._period_s)
             self._report_hold(silence and f"no reply from leader {chain.joints[oldest]} {silence}, holding")
             self._at = motion.advance_joints(*twist, self._period_s)

@@ -11,7 +11,7 @@ from pydantic import BeforeValidator, Field, TypeAdapter, model_validator
 
 from dxlrun import NAMED_POSE, Angle, AngularVelocity, CommandModel, Floats, Length, LinearVelocity
 from dxlrun.tooling.robots import Transform, from_rpy, product
-from dxlrun_space.chain import Vector
+from dxlrun_space.chain import Quaternion, Vector
 
 NORM: Final = 1e-3
 """Largest difference of a quaternion's length from 1: three decimals of each number."""

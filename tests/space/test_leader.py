@@ -1,6 +1,7 @@
 """A tip that follows the tip of another arm, which a hand moves; judged by what the follower was sent."""
 
 import math
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -8,10 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 from pydantic import ValidationError
-from tests.kit.driven import changes
+from tests.kit.driven import DrivenRobot, changes
 from tests.kit.judged_arms import apart, example
 from tests.kit.stages import Stage
 
+from dxlrun import RemoteRobot
 from dxlrun.testing import plan_of, simulated_robot
 from dxlrun_space.cartesian_controller import CartesianController
 
@@ -45,6 +47,34 @@ def test_an_arm_of_four_joints_follows_a_hand_at_one_of_five() -> None:
     speeds = [np.linalg.norm(after - before) / 0.02 for before, after in pairwise(tips)]
     assert max(speeds) < 0.5 + 2 * TICK * 0.4 / 0.02
     assert np.abs(np.diff(rows, axis=0)).max() / 0.02 < 4.8
+
+
+@pytest.mark.parametrize("relative", [True, False])
+def test_a_released_follower_stays_and_only_a_relative_one_goes_on_from_there(relative: bool) -> None:
+    driven = DrivenRobot(ROBOT, 9.0, {"relative": str(relative).lower()})
+    leader = next(bus for bus in driven.virtual.buses if bus.name == "koch")
+    ways = (0.0, 0.1, 0.3, 0.0, 0.0), (0.4, 0.2, 0.1, -0.2, 0.0), (-0.3, -0.1, 0.0, 0.0, 0.0)
+    for second, turns in zip((3.0, 4.5, 7.0), ways, strict=True):
+        for number, (turn, sign) in enumerate(zip(turns, SIGNS, strict=True), 1):
+            turned = partial(leader.servo(number).turn_shaft, turn * sign, 500_000_000)
+            leader.at(round(second * 1e9), turned)
+
+    def begin(robot: RemoteRobot) -> Any:
+        steps = [(4.2, partial(robot.switch, deactivate=["arm"])), (5.5, partial(robot.switch, ["arm"]))]
+        return lambda now: steps.pop(0)[1]() if steps and now >= steps[0][0] else None
+
+    driven.run(begin)
+    sent = changes(driven.virtual.ledger.entries, driven.virtual.plan, 116)
+    times = np.arange(2.9, 9.0, 0.02)
+    rows = np.array([[_at(sent[servo], time) for servo in (11, 12, 13, 14)] for time in times])
+    tips = np.array([FOLLOWER.matrix(row)[:3, 3] for row in rows])
+    before, released, engaged, end = (tips[np.searchsorted(times, at)] for at in (2.9, 4.3, 6.9, 8.9))
+    first, second, third = (1.2 * LEADER.matrix(turns)[:3, 3] for turns in np.cumsum(ways, axis=0))
+    assert np.linalg.norm(released - before) > 0.02
+    assert (rows[(times > 4.3) & (times < 5.5)] == rows[np.searchsorted(times, 4.3)]).all()
+    assert np.linalg.norm(second - first) > 0.05
+    assert (np.linalg.norm(engaged - released) < 1e-3) == relative
+    assert end - engaged == pytest.approx(third - second, abs=2e-3)
 
 
 def _at(found: list[tuple[float, int]], time: float) -> float:
@@ -107,6 +137,15 @@ def test_a_leader_that_does_not_answer_is_waited_for() -> None:
     assert LEADER.matrix(lead)[:3, 3] == pytest.approx(
         FOLLOWER.matrix(led(stage, lead, 4.0)[-1])[:3, 3], abs=1e-3
     )
+
+
+def test_a_relative_follower_goes_on_from_where_it_is_when_the_leader_answers_again() -> None:
+    stage, lead, away = staged(relative=True), (0.2, 0.2, 0.1, 0.4, 0.0), (0.4, 0.3, 0.1, 0.2, 0.0)
+    begin = led(stage, lead, 0.4)[-1]
+    led(stage, lead, 0.5, age_s=0.2)
+    assert led(stage, away, 1.0) == pytest.approx(np.tile(begin, (50, 1)), abs=1e-6)
+    moved = FOLLOWER.matrix(led(stage, lead, 3.0)[-1])[:3, 3] - FOLLOWER.matrix(begin)[:3, 3]
+    assert moved == pytest.approx((LEADER.matrix(lead) - LEADER.matrix(away))[:3, 3], abs=1e-3)
 
 
 def test_what_leads_takes_no_poses_and_does_not_follow() -> None:
