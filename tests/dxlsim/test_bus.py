@@ -128,6 +128,17 @@ def test_an_interrupt_before_a_task_of_the_line_begins_is_not_lost():
         bus.receive_bytes(PING_1, 0)
 
 
+@pytest.mark.parametrize("split", ["whole", "byte"])
+def test_a_reply_that_is_due_is_delivered_after_an_exception_of_an_action(split):
+    bus, other = new_bus(AdapterConfig(split=split)), new_bus()
+    for one in (bus, other):
+        one.receive_bytes(READ_1, 0)
+    bus.at(1000, [].pop)
+    with pytest.raises(IndexError):
+        bus.drain_bytes(LATER)
+    assert bus.drain_bytes(LATER) == other.drain_bytes(LATER) != b""
+
+
 def test_the_exit_of_the_interpreter_frees_no_line_that_a_thread_may_still_serve(monkeypatch):
     made: list[weakref.finalize] = []
 

@@ -971,7 +971,8 @@ int64_t line_drain(Bus *b, int64_t now_ns, int64_t handed_ns)
 {
     int32_t handed = 0;
     line_pass_time(b, now_ns);
-    if (b->line.wedged)
+    /* After an exception, replies that are due have not arrived. */
+    if (b->line.wedged || b->line.raised)
         return b->out.size;
     for (;;) {
         int64_t due_ns;
