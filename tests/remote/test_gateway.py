@@ -3,12 +3,14 @@
 import asyncio
 import json
 import signal
+import time
 from string import Formatter
 
 import msgspec
 import numpy as np
 import pytest
 from msgspec.structs import replace
+from tests.kit.awaited import DEADLINE_S
 from tests.kit.pages import page_text
 from tests.remote.conftest import Arm, Desk
 
@@ -17,7 +19,8 @@ from dxlrun.channels.commands import MOST_PER_CYCLE
 from dxlrun.channels.cycle import CycleLayout, CycleRecord
 from dxlrun.channels.event_records import EventBody, EventCode, Severity
 from dxlrun.compile.joints.limits import LimitViolation
-from dxlrun.control.controllers.plugin_loading import Offer, PlugIns
+from dxlrun.compile.joints.poses import Poses
+from dxlrun.control.controllers.plugin_loading import Offer, PlugIns, load_plugins
 from dxlrun.remote import asked, link, preparation, server
 from dxlrun.remote.preparation import PreparedCommand, RefusedRequest, in_si
 from dxlrun.remote.requests import request_table as requests
@@ -499,6 +502,15 @@ def test_a_plug_in_that_never_returns_is_interrupted_and_the_next_client_is_serv
     assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
     assert desk.ask("POST", "/stop") == (200, DONE)
     assert [command.kind for command in desk.taken] == ["stop"]
+
+
+def test_poses_that_take_long_are_interrupted(monkeypatch):
+    monkeypatch.setattr(preparation, "BUDGET_S", 0.05)
+    monkeypatch.setattr(Poses, "find_positions", lambda *_: time.sleep(DEADLINE_S))
+    motions = {"a": {"steps": [{"time": "1 s", "pose": "rest"}]}}
+    entry = {"name": "more", "type": "keyframe_player", "joints": ["pan"], "motions": motions}
+    status, content = Desk(plugins=load_plugins()).ask("POST", "/controllers", entry)
+    assert (status, content["refused"].partition(" s ")[0]) == (422, "more needed more than 0.05")
 
 
 class WatchedOffers(dict):

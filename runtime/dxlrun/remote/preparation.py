@@ -306,7 +306,7 @@ class Preparation:
             body = in_si(body, what, known.joints)
         if pose_places(model):
             with suppress(msgspec.MsgspecError, RecursionError):  # refused with the other mistakes
-                body = msgspec.json.encode(self._posed(msgspec.json.decode(body), what, model))
+                body = msgspec.json.encode(self._posed(msgspec.json.decode(body), plan.name, what, model))
         with plugin_code(plan.name, what, model):
             command = model.model_validate_json(body, strict=True)
             prepared = controller.prepare(kind, command, known.parameters)
@@ -317,9 +317,10 @@ class Preparation:
             beyond = tuple(beyond_limits(known.joints, command, peaks))
         return PreparedCommand(plan.name, kind, data, beyond, body)
 
-    def _posed(self, written: object, what: str, model: type[BaseModel]) -> object:
-        """Return data of a model with positions in place of names of poses; raise RefusedRequest."""
-        posed, wrong = self.poses.put_in(written, model)
+    def _posed(self, written: object, controller: str, what: str, model: type[BaseModel]) -> object:
+        """Return data of a model with positions in place of poses; raise RefusedRequest."""
+        with plugin_code(controller, what):  # Features solve poses
+            posed, wrong = self.poses.put_in(written, model)
         if wrong:
             raise invalid(
                 "; ".join(f"{what}: {problem}; {fix}" for _, problem, fix in wrong[:_MOST_MISTAKES])
@@ -365,7 +366,7 @@ class Preparation:
         if entry.get("active"):
             raise invalid(texts.active_at_once(name))
         if (offer := self.plugins.controllers.get(written.type)) is not None:
-            parameters = self._posed(written.parameters, name, offer.controller.Parameters)
+            parameters = self._posed(written.parameters, name, name, offer.controller.Parameters)
             written = written.model_copy(update={"parameters": parameters})
         # The divider is 1 here; the loop computes it for its own rate.
         plan = self._compiled(replace(plan_entry(name, written, every=1), active=False))
