@@ -105,7 +105,9 @@ def _name_key(robot: RemoteRobot, controller: str, kind: str) -> str:
     """Return `key=` with the first key of a command; empty if that key does not accept a name."""
     listed = robot.info().get("controllers")
     found = [one["takes"] for one in listed if one["name"] == controller] if isinstance(listed, list) else []
-    fields = found[0].get(kind, {}).get("properties", {}) if found else {}
+    if not found:
+        return "name="  # The gateway refuses an unknown controller, whatever the keys are
+    fields = found[0].get(kind, {}).get("properties", {})
     for key, field in [*fields.items()][:1]:
         if any(each.get("type") == "string" for each in field.get("anyOf", [field])):
             return f"{key}="
