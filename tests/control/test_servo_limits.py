@@ -4,7 +4,7 @@ import pytest
 from tests.kit.loops import GateRig
 
 from dxlrun.channels.cycle import Clamp
-from dxlrun.channels.event_records import EventCode
+from dxlrun.channels.event_records import EventCode, Severity
 from dxlrun.plan.loop_plan import JointPlan, ServoLimit
 from dxlwire.modes import Mode
 
@@ -27,6 +27,13 @@ def test_goals_without_a_speed_get_the_one_that_the_servo_will_take():
         "j0: goals of velocity are held to Velocity Limit (44) = 83, 114 deg/s, tighter"
     )
     assert rig.texts[-1].endswith("clamped by register Velocity Limit (44) = 83, 114 deg/s")
+
+
+@pytest.mark.parametrize(("velocity", "severity"), [(4.0, Severity.WARNING), (None, Severity.INFO)])
+def test_a_register_is_a_warning_only_where_it_is_tighter_than_the_file(velocity, severity):
+    rig = GateRig(velocity=velocity, top_speed=8.0, accepts=(EventCode.SERVO_LIMITS,))
+    rig.gate.take_servo_limits({0: (ServoLimit("velocity", 2.0, "Velocity Limit (44) = 83, 114 deg/s"),)})
+    assert rig.severities == [severity]
 
 
 @pytest.mark.parametrize(

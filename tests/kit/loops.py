@@ -452,7 +452,10 @@ class Sent(NamedTuple):
 
 
 class GateRig:
-    """The gate of joints of -1..1 rad, fed cycle by cycle; controller b is active, events are in `texts`."""
+    """The gate of joints of -1..1 rad, fed cycle by cycle; controller b is active.
+
+    Events are in `texts`, each with its severity in `severities`.
+    """
 
     def __init__(
         self,
@@ -474,6 +477,7 @@ class GateRig:
         controllers = [plan_of(name, joints=names) for name in "ab"]
         self.dt_ns, self._accepts = dt_ns, accepts
         self.texts: list[str] = []
+        self.severities: list[Severity] = []
         self.plan = loop_plan(plans, controllers, period_ns=dt_ns, sources=tuple(sources))
         self.record = CycleRecord(self.plan.layout)
         self.record.active = 0b10
@@ -490,6 +494,7 @@ class GateRig:
     def emit_event(self, source: str, event: EventBody, data: bytes = b"") -> None:
         assert event.code in self._accepts
         self.texts.append(event.text)
+        self.severities.append(event.severity)
 
     def apply(self, dt_ns: int = 0, **commands: Any) -> Sent:
         """Command these values for a cycle; what is not named is not commanded."""

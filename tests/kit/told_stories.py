@@ -138,7 +138,9 @@ class Story:
             lose_replies(robot.buses[0], number, at_ms * 1_000_000, (at_ms + for_ms) * 1_000_000)
         self._watch(robot)
         self.result, self.virtual = robot.run(), robot
-        assert all(isinstance(answer, Completion) for answer in client.answers.values()), client.answers
+        answers = [*client.answers.values()]
+        assert all(isinstance(answer, Completion) for answer in answers), answers
+        assert len(answers) == len(self.asks), f"{len(answers)} of {len(self.asks)} requests were answered"
         assert replay_log(path).same
         self.log: Log = read_log(path)
         ended = [event for event in self.log.events if event.code == EventCode.GOAL_ENDED]
