@@ -16,10 +16,12 @@ from dxlrun_space.reach import dexterity
 
 def compile_tip_poses(compilation: Compilation) -> Contribution:
     """Return the joints of each pose, and the rows of the poses' table."""
-    file, body, poses, rows = compilation.file, compilation.body, dict[str, dict[str, float]](), list[Row]()
+    file, body, rows = compilation.file, compilation.body, list[Row]()
     joints = {name: joint.plan for name, joint in compilation.joints.items()}
     mistaken = file.robot.joints.keys() - joints.keys()
-    for name, pose in form.STAGE.section_of(file.robot).items():
+    written = form.STAGE.section_of(file.robot)
+    poses: dict[str, dict[str, float] | None] = dict.fromkeys(written)
+    for name, pose in written.items():
         if body is None and file.robot.model is not None:
             break
         try:

@@ -108,7 +108,7 @@ def compile_motions(
 
 def with_poses(motion: MotionDescription, poses: Poses) -> MotionDescription:
     """Return a motion whose points have the joints of the poses that they name; raise InputError."""
-    problems = Problems()
+    problems, wrong_poses = Problems(), list[WrongPose]()
 
     def posed(point: Point, number: int, index: int) -> Point:
         if point.pose is None:
@@ -122,6 +122,7 @@ def with_poses(motion: MotionDescription, poses: Poses) -> MotionDescription:
                 else {joint: Measure(at, poses.joints[joint].unit.si) for joint, at in positions.items()}
             )
         except WrongPose as wrong:
+            wrong_poses.append(wrong)
             for problem in wrong.problems:
                 problems.error(motion.marks.value(*path), *problem)
             return point
@@ -139,7 +140,8 @@ def with_poses(motion: MotionDescription, poses: Poses) -> MotionDescription:
         else part
         for index, part in enumerate(motion.motion.motions)
     ]
-    problems.raise_errors()
+    if wrong_poses or problems.errors:
+        raise InputError(problems.errors)
     return structs.replace(motion, motion=motion.motion.model_copy(update={"motions": tuple(parts)}))
 
 

@@ -43,14 +43,17 @@ def compile_poses(
     _check_poses(file, joints)
     poses: dict[str, Mapping[str, float]] = {name: {} for name in file.description.omitted_poses}
     poses |= file.robot.poses
+    mistaken = set[str]()
     for section, contribution in contributions.items():
         for name, positions in contribution.poses.items():
             if name in poses:
                 file.error(file.key(section, name), f"{name} is already the name of a pose", "rename one")
-            poses[name] = positions
+            poses[name] = positions or {}
+            if positions is None:
+                mistaken.add(name)
     plans = {name: joint.plan for name, joint in joints.items()}
     wrong = len(plans) < len(file.robot.joints) or (urdf is None and file.robot.model is not None)
-    return Poses(poses, plans, file.description.omitted, urdf, wrong)
+    return Poses(poses, plans, file.description.omitted, urdf, wrong, mistaken)
 
 
 def compile_policies(

@@ -7,7 +7,7 @@ A class declares each field that can have a name by `NAMED_POSE`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import cache
 from types import UnionType
 from typing import Annotated, Final, Union, get_args, get_origin
@@ -29,7 +29,10 @@ _EACH: Final = -1
 
 
 class WrongPose(ValueError):
-    """Raised for a pose without positions of joints; its text has a line `problem; fix` for each problem."""
+    """Raised for a pose without positions of joints; its text has a line `problem; fix` for each problem.
+
+    It is empty if the mistake is already reported.
+    """
 
     @property
     def problems(self) -> list[tuple[str, str]]:
@@ -49,6 +52,8 @@ class Poses(msgspec.Struct, frozen=True):
     """Text of the robot's URDF."""
     has_mistakes: bool = False
     """True if a joint or the URDF has a mistake, which is reported; features solve no poses then."""
+    mistaken: Collection[str] = ()
+    """Poses with a mistake, which is reported."""
 
     def find_positions(self, written: object) -> Mapping[str, float] | None:
         """Return the positions of the pose with a name, or of a pose in the form of a feature; None: neither.
@@ -62,10 +67,12 @@ class Poses(msgspec.Struct, frozen=True):
             return None
         for _, stage in stages(PoseStage, installed_features()):
             if stage.key in written:
-                return {} if self.has_mistakes else self._solve(stage, written)
+                return self._solve(stage, written)
         return None
 
     def _solve(self, stage: PoseStage[BaseModel], written: object) -> Mapping[str, float]:
+        if self.has_mistakes:
+            raise WrongPose
         try:
             return stage.solve(stage.form.model_validate(written), self.urdf, self.joints)
         except ValidationError as error:
@@ -77,6 +84,8 @@ class Poses(msgspec.Struct, frozen=True):
         """Return the positions of the pose with a name; raise WrongPose as `find_positions`."""
         if positions := self.named.get(name):
             return {joint: at for joint, at in positions.items() if joint in self.joints}
+        if name in self.mistaken:
+            raise WrongPose
         if name in self.named:
             joints = ", ".join(self.omitted)
             raise WrongPose(f"pose {name} needs a joint that is omitted ({joints}); run with {joints}")
