@@ -207,7 +207,8 @@ class CartesianController(Controller[CartesianParameters]):
     ) -> NDArray[np.float64]:
         """Return a pose or a twist as one flat array. Raises ValueError if the tip follows a leader."""
         if parameters.leader is not None:
-            raise ValueError(f"the tip follows a leader; a {kind} is not accepted")
+            fix = "send it to a cartesian_controller without `leader`"
+            raise ValueError(f"the tip follows a leader, so a {kind} is not accepted; {fix}")
         if isinstance(command, PoseCommand) and command.pose is not None:
             if lacking := [joint for joint in parameters.joints if joint not in command.pose]:
                 raise ValueError(f"the pose has no position of {', '.join(lacking)}; name a pose of this arm")

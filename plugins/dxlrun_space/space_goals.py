@@ -95,7 +95,7 @@ class PoseCommand(CommandModel):
     def _consistent(self) -> Self:
         for axis in "xyz":
             if getattr(self, axis) is not None and getattr(self, f"d{axis}") is not None:
-                raise ValueError(f"give either {axis} or d{axis}")
+                raise ValueError(f"{axis} and d{axis} exclude each other; omit one of them")
         turns = (self.rpy, self.drpy, self.quaternion)
         given = any(each is not None for each in (self.x, self.y, self.z, self.dx, self.dy, self.dz, *turns))
         if self.pose is not None:
@@ -103,7 +103,7 @@ class PoseCommand(CommandModel):
                 raise ValueError("a pose by name has no other coordinates, frame or path; remove them")
             return self
         if not given:
-            raise ValueError("give a coordinate or an orientation, such as dz=5cm")
+            raise ValueError("the pose is empty; give a coordinate or an orientation, for example dz=5cm")
         check_turns(self.quaternion, self.rpy, self.drpy)
         return self
 

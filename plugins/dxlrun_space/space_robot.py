@@ -7,6 +7,7 @@ from typing import Literal, cast
 
 import dxlrun
 from dxlrun import DxlrunError, GoalState, Refused, RemoteRobot
+from dxlrun.tooling.files import suggestion
 
 Distance = float | str | None
 """Length in m, or as text with its unit: `"5 cm"`. None: not given."""
@@ -71,8 +72,13 @@ class SpaceRobot(RemoteRobot):
         }  # fmt: skip
         given = {name: value for name, value in fields.items() if value is not None}
         arms = self._arms()
-        if arm not in arms and (arm or len(arms) != 1):
-            raise DxlrunError(f"{self.name} has {len(arms)} arms ({', '.join(arms)}); name one")
+        if not arms:
+            fix = "add a `cartesian_controller` to its robot file"
+            raise DxlrunError(f"{self.name} has no arm that moves to poses; {fix}")
+        if arm and arm not in arms:
+            raise DxlrunError(f"{self.name} has no arm {arm}; {suggestion(arm, arms)}")
+        if not arm and len(arms) > 1:
+            raise DxlrunError(f"{self.name} has {len(arms)} arms; name one of {', '.join(arms)}")
         try:
             (goal,) = self.send(arm or arms[0], "pose", given).goals
         except Refused as refused:

@@ -170,7 +170,7 @@ def test_a_duration_is_kept() -> None:
         ({"quaternion": [0, 0, 0, 2]}, "has length 2; scale it"),
         ({"rpy": [0, 90, 0]}, "90 rad is more than a turn"),
         ({"rpy": [0, 0, 0], "drpy": [0, 0, 0]}, "give only one of rpy"),
-        ({"x": 0.1, "dx": 0.1}, "give either x or dx"),
+        ({"x": 0.1, "dx": 0.1}, "x and dx exclude each other; omit one"),
         ({"dz": "5"}, "has no unit"),
         ({"rpy": "0, 5, 0"}, "has no unit"),
         ({"dz": 0.1, "seconds": 0}, "greater than 0"),

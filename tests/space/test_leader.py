@@ -149,7 +149,7 @@ def test_a_relative_follower_goes_on_from_where_it_is_when_the_leader_answers_ag
 
 
 def test_what_leads_takes_no_poses_and_does_not_follow() -> None:
-    with pytest.raises(ValueError, match="follows a leader; a pose is not accepted"):
+    with pytest.raises(ValueError, match="so a pose is not accepted; send it to a cartesian_cont"):
         staged().prepare("pose", dz=0.01)
     with pytest.raises(ValidationError, match="leader_pan is leader and follower"):
         CartesianController.Parameters.model_validate(
