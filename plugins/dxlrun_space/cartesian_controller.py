@@ -46,7 +46,7 @@ from dxlrun_space.path import (
     plan_line,
     plan_positions,
 )
-from dxlrun_space.solver import FULL, Solver, distance, residual_of
+from dxlrun_space.solver import Solver, demands_orientation, distance, residual_of
 from dxlrun_space.space_goals import PoseCommand, TwistCommand, packed, unpacked
 from dxlrun_space.stream import TipMotion
 
@@ -248,9 +248,7 @@ class CartesianController(Controller[CartesianParameters]):
         )
         posture = [parameters.posture.get(joint) for joint in joints]
         self._solver = Solver(self._chain, limits.lower.tolist(), limits.upper.tolist(), posture)
-        self._exact = parameters.orientation == "exact" or (
-            parameters.orientation is None and len(joints) >= FULL
-        )
+        self._exact = demands_orientation(parameters.orientation, len(joints))
         self._steps = min(MOST_STEPS, max(1, context.period_ns // STEP_NS))
         self._motion = TipMotion(self._solver, self._limits, exact=self._exact, steps=self._steps // 2 + 2)
         self._at: Positions = ()

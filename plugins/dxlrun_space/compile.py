@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Collection, Mapping
 
 import msgspec
 
@@ -12,6 +13,7 @@ from dxlrun_space import form
 from dxlrun_space.chain import Chain, WrongChain
 from dxlrun_space.pose_form import chain_of, solve_pose
 from dxlrun_space.reach import dexterity
+from dxlrun_space.solver import CLOSE_RAD
 
 
 def compile_tip_poses(compilation: Compilation) -> Contribution:
@@ -19,6 +21,7 @@ def compile_tip_poses(compilation: Compilation) -> Contribution:
     file, body, rows = compilation.file, compilation.body, list[Row]()
     joints = {name: joint.plan for name, joint in compilation.joints.items()}
     mistaken = file.robot.joints.keys() - joints.keys()
+    arms = [each for each in file.robot.controllers.values() if each.type == "cartesian_controller"]
     written = form.STAGE.section_of(file.robot)
     poses: dict[str, dict[str, float] | None] = dict.fromkeys(written)
     for name, pose in written.items():
@@ -31,7 +34,12 @@ def compile_tip_poses(compilation: Compilation) -> Contribution:
                 file.warning(file.key("tip_poses", name), what, f"run with {omitted} to have it")
                 poses[name] = {}
             elif mistaken.isdisjoint(chain.joints):
-                row = _row(chain, pose, joints)
+                moving = [each.parameters for each in arms if each.parameters.get("tip") == pose.tip]
+                row = _row(chain, pose, joints, [each.get("orientation") for each in moving])
+                if not moving and row["orientation_error"] > CLOSE_RAD:
+                    off = math.degrees(row["orientation_error"])
+                    what = f"pose {name} is {off:.1f} deg from its orientation, which the arm cannot reach"
+                    file.warning(file.key("tip_poses", name), what, "give it another orientation")
                 poses[name] = row["joints"]
                 rows.append({"name": name, "tip": pose.tip, **row})
         except WrongChain as wrong:
@@ -39,9 +47,11 @@ def compile_tip_poses(compilation: Compilation) -> Contribution:
     return Contribution(poses=poses, plan=msgspec.json.encode(rows))
 
 
-def _row(chain: Chain, pose: form.TipPose, joints: Mapping[str, JointPlan]) -> Row:
+def _row(
+    chain: Chain, pose: form.TipPose, joints: Mapping[str, JointPlan], orientations: Collection[object]
+) -> Row:
     """Return the row of a pose with its joints."""
-    solver, positions, orientation_error = solve_pose(pose, chain, joints)
+    solver, positions, orientation_error = solve_pose(pose, chain, joints, orientations)
     ends = zip(positions, solver.lower, solver.upper, strict=True)
     margins = [min(at - low, high - at) for at, low, high in ends]
     least = margins.index(min(margins))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import NamedTuple
 
 from dxlrun.tooling.features import PoseStage
@@ -11,7 +11,7 @@ from dxlrun.tooling.robots import Urdf, read_urdf
 from dxlrun_space.chain import BASE, Chain, WrongChain
 from dxlrun_space.form import TipPose
 from dxlrun_space.path import out_of_reach, suffices
-from dxlrun_space.solver import FULL, Solver, finish_search
+from dxlrun_space.solver import Solver, demands_orientation, finish_search
 
 
 class SolvedPose(NamedTuple):
@@ -23,8 +23,13 @@ class SolvedPose(NamedTuple):
     """Angle to the orientation that was asked for, rad; 0 if none was."""
 
 
-def solve_pose(pose: TipPose, chain: Chain, joints: Mapping[str, JointPlan]) -> SolvedPose:
-    """Return the joints of a chain that have a pose; raise WrongChain if there are none."""
+def solve_pose(
+    pose: TipPose, chain: Chain, joints: Mapping[str, JointPlan], orientations: Collection[object] = ()
+) -> SolvedPose:
+    """Return the joints of a chain that have a pose; raise WrongChain if there are none.
+
+    `orientations` are the parameters `orientation` of the controllers that move the tip.
+    """
     for joint in chain.joints:
         if joint not in joints:
             what = f"{joint} moves {pose.tip}, but is omitted or has no servo"
@@ -37,7 +42,9 @@ def solve_pose(pose: TipPose, chain: Chain, joints: Mapping[str, JointPlan]) -> 
     solver = Solver(chain, [plan.lower for plan in plans], [plan.upper for plan in plans], near)
     start = tuple(each or 0.0 for each in near)
     goal = pose.as_command()
-    exact = goal.asks_orientation and len(plans) >= FULL
+    exact = goal.asks_orientation and any(
+        demands_orientation(each, len(plans)) for each in orientations or (None,)
+    )
     target = goal.target(BASE, chain.pose(start))
     search = (
         solver.search(target, start, exact=exact)

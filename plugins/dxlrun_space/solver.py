@@ -59,6 +59,16 @@ FULL: Final = 6
 """Degrees of freedom of a pose. Fewer joints lack orientations, and more leave a choice."""
 
 
+def demands_orientation(orientation: object, joints: int) -> bool:
+    """Return True if a pose is not reached without its orientation.
+
+    Args:
+        orientation: Parameter `orientation` of the arm's controller; None: not given.
+        joints: Number of the arm's joints.
+    """
+    return orientation == "exact" or (orientation is None and joints >= FULL)
+
+
 class Residual(msgspec.Struct, frozen=True):
     """Distance of a pose from its target."""
 
