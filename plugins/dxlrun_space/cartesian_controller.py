@@ -139,7 +139,7 @@ class PosePlan:
     """Message of the topic `plan`: the motion that the command `plan` asked for, and that is not made."""
 
     x: float
-    """Goal position of the tip in the base, m."""
+    """Goal position of the tip in the base, m; NaN if the place of the pose is not known."""
     y: float
     z: float
     positions: Floats
@@ -260,7 +260,9 @@ class CartesianController(Controller[CartesianParameters]):
 
     def _forget(self) -> None:
         self._task: Task | None = None
-        self._moves = self._brakes = self._is_trying = False
+        self._moves = self._brakes = False
+        self._tried: Transform | None = None
+        """Goal pose of the tip for which `plan` asked, until the answer."""
         self._goal: Goal | None = None
         self._waiting: PoseCommand | None = None
         self._is_cancelled = False
@@ -272,9 +274,14 @@ class CartesianController(Controller[CartesianParameters]):
 
     def on_activate(self, time_ns: int) -> None:
         """Hold the joints at their last goals."""
+        self._drop_plan("the controller was activated again; ask again")
         self._forget()
         self._hold_joints()
         self._write()
+
+    def on_deactivate(self, time_ns: int) -> None:
+        """Answer a request for a plan that is not finished."""
+        self._drop_plan("the controller was deactivated; ask again when it is active")
 
     def _hold_joints(self) -> str:
         """Hold the positions that were sent, or else the measured ones; return a joint that has neither."""
@@ -303,11 +310,22 @@ class CartesianController(Controller[CartesianParameters]):
         if kind == "twist":
             if self._at or not self._hold_joints():
                 self._follow_twist(unpacked(data, TwistCommand), time_ns)
-        elif self._moves or self._goal is not None:
-            self._publish("the arm moves; ask again when it rests")
         else:
-            self._drop_plan("replaced by a newer request")
-            self._task, self._is_trying = self._try(unpacked(data, PoseCommand)), True
+            self._begin_plan(unpacked(data, PoseCommand))
+
+    def _begin_plan(self, asked: PoseCommand) -> None:
+        self._drop_plan("replaced by a newer request")
+        try:
+            if joint := "" if self._at else self._hold_joints():
+                raise ValueError(f"joint {joint} has not answered yet")
+            goal = self._goal_pose(asked)
+        except (LookupError, ValueError) as error:
+            self._publish(None, str(error))
+            return
+        if self._moves or self._goal is not None:
+            self._publish(goal, "the arm moves; ask again when it rests")
+        else:
+            self._task, self._tried = self._try(asked, goal), goal
 
     def _follow_twist(self, twist: TwistCommand, time_ns: int) -> None:
         self._turns_with_tip = twist.frame == self._chain.tip
@@ -356,6 +374,12 @@ class CartesianController(Controller[CartesianParameters]):
         goal, self._goal = self._goal, None
         if goal is not None:
             goal.end(outcome, text)
+
+    def _goal_pose(self, asked: PoseCommand) -> Transform:
+        """Return the goal pose of the tip in the base. Raises as `_pose_of`."""
+        if asked.pose is not None:
+            return self._chain.pose(tuple(asked.pose.values()))
+        return asked.target(self._pose_of(asked.frame), self._chain.pose(self._at))
 
     def _pose_of(self, frame: str) -> Transform:
         """Return the pose of a frame in the base. Raises LookupError or ValueError with what prevents it."""
@@ -413,17 +437,14 @@ class CartesianController(Controller[CartesianParameters]):
     def _planned(self, asked: PoseCommand) -> Planning:
         """Plan a motion from rest."""
         try:
-            frame = self._pose_of(asked.frame)
+            self._target = self._goal_pose(asked)
         except (LookupError, ValueError) as error:
             return NoPath(str(error))
         solver, exact = self._solver, self._exact and asked.asks_orientation
         at, limits = self._at, self._limits
         if asked.pose is not None:
-            positions = tuple(asked.pose.values())
-            self._target = self._chain.pose(positions)
-            planning = plan_positions(solver, at, positions, self._target, limits)
+            planning = plan_positions(solver, at, tuple(asked.pose.values()), self._target, limits)
         else:
-            self._target = asked.target(frame, self._chain.pose(at))
             plan = plan_line if asked.path == "line" else plan_joints
             planning = plan(solver, at, self._target, limits, exact=exact)
         found = yield from planning
@@ -432,23 +453,26 @@ class CartesianController(Controller[CartesianParameters]):
             return NoPath(f"the motion takes {needed:.2f} s within its limits; ask for at least this time")
         return found
 
-    def _try(self, asked: PoseCommand) -> Task:
+    def _try(self, asked: PoseCommand, goal: Transform) -> Task:
         """Plan a motion from rest to a pose, and publish it."""
         found = yield from self._planned(asked)
-        self._is_trying = False
+        self._tried = None
         if isinstance(found, NoPath):
-            self._publish(found.text)
+            self._publish(goal, found.text)
         else:
-            self._publish(_remark(found, asked), found.last, found.duration_s)
+            self._publish(goal, _remark(found, asked), found.last, found.duration_s)
 
     def _drop_plan(self, reason: str) -> None:
         """Answer a request for a plan that is not finished with the reason why it never will be."""
-        if self._is_trying:
-            self._is_trying = False
-            self._publish(reason)
+        goal, self._tried = self._tried, None
+        if goal is not None:
+            self._task = None
+            self._publish(goal, reason)
 
-    def _publish(self, text: str, positions: Positions = (), seconds: float = math.nan) -> None:
-        x, y, z = (self._target or BASE).translation
+    def _publish(
+        self, goal: Transform | None, text: str, positions: Positions = (), seconds: float = math.nan
+    ) -> None:
+        x, y, z = (math.nan,) * 3 if goal is None else goal.translation
         last = np.array(positions or (math.nan,) * len(self.context.joints))
         self.context.publish("plan", PosePlan(x, y, z, last, seconds, text))
 

@@ -214,6 +214,30 @@ def test_a_plan_is_published_and_moves_nothing() -> None:
     assert texts == ["replaced by a newer request", "the arm moves; ask again when it rests"]
 
 
+def test_each_plan_is_answered_with_its_own_coordinates() -> None:
+    """Also in the cycle in which it arrived, while the arm moves, and if its controller is reactivated."""
+    stage = staged()
+    stage.give("plan", x=0.15, y=0.0, z=0.2)
+    stage.give("plan", x=0.16, y=0.0, z=0.2)
+    stage.give("plan", x=0.2, frame="no")
+    played(stage, 1.0)
+    stage.give("plan", x=0.17, y=0.0, z=0.2)
+    stage.activate()
+    stage.give("plan", x=0.18, y=0.0, z=0.2)
+    stage.controller.on_deactivate(stage.time_ns)
+    stage.activate().send(None, "pose", dz=0.05)
+    stage.give("plan", x=0.19, y=0.0, z=0.2)
+    played(stage, 3.0)
+    assert [f"{plan.x:g} {plan.text:.20}" for _, plan in stage.messages] == [
+        "0.15 replaced by a newer ",
+        "0.16 replaced by a newer ",
+        "nan frame no not found; ",
+        "0.17 the controller was a",
+        "0.18 the controller was d",
+        "0.19 the arm moves; ask a",
+    ]
+
+
 def test_a_cancel_brakes_on_the_line() -> None:
     stage, begin = staged(), all_arms()["open_manipulator_x"].matrix(READY)
     stage.send(0.0, "pose", dz=0.1)
