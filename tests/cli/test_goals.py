@@ -56,6 +56,7 @@ class Robot:
         self.goals_begin = True
         self.file = Path("/nowhere/torso.yaml")
         self.omitted: list[str] = []
+        self.paused = False
 
     def __enter__(self) -> Robot:
         return self
@@ -117,7 +118,8 @@ class Robot:
             for name, moved in JOINTS.items()
         ]
         omitted = {"omitted": self.omitted} if self.omitted else {}
-        return {"file": str(self.file), "groups": {}, "controllers": controllers} | omitted
+        facts = {"file": str(self.file), "groups": {}, "controllers": controllers, "paused": self.paused}
+        return facts | omitted
 
     def goals(self) -> list[GoalState]:
         return [states[0] for states in self.script.values() if isinstance(states[0], GoalState)]
@@ -176,6 +178,7 @@ def test_goal_at_the_terminal(dxlrun: Dxlrun, robot: Robot, reader: Path, case: 
         "begun": robot.begin,
         "refused": robot.refuse,
         "omits": robot.omitted.append,
+        "paused": lambda _: setattr(robot, "paused", True),
         "no": lambda _: setattr(robot, "goals_begin", False),
         "at": lambda _: setattr(robot, "file", reader / "torso.yaml"),
     }

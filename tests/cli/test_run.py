@@ -89,6 +89,9 @@ FAULT = EventGroup(EventCode.CONTROLLER_FAULT, Severity.ERROR, "head", 1, 5_100_
 LIMP = EventGroup(EventCode.SERVO_LIMP, Severity.ERROR, "head_pitch_joint", 1, 5_100_000_000, "torque is off")
 LOST = EventGroup(EventCode.SERVO_LOST, Severity.ERROR, "head", 1, 10**9, "no longer there")
 TAKEOVER = EventGroup(EventCode.TAKEOVER, Severity.WARNING, "reflex", 1, 5_100_000_000, "it falls")
+EXPIRED = EventGroup(
+    EventCode.STALE_COMMAND, Severity.WARNING, "loop", 1, 5_100_000_000, "no client is there"
+)
 KEPT = "The loop kept 50 Hz: 0 of 100 periods skipped."
 VALID = (0,) * 8
 
@@ -126,6 +129,7 @@ def totals(group: EventGroup) -> EventTotals:
             0,
             ["done: at 0.1 s reflex took over the robot: it falls; ran for 2.0 s.", KEPT],
         ),
+        ({"events": totals(EXPIRED)}, 0, ["done: at 0.1 s no client is there; ran for 2.0 s.", KEPT]),
         ({"events": totals(FAULT)}, 1, ["ran for 2.0 s.", "head: head: nan."]),
         (
             {"events": EventTotals(goals=GoalTotals({"accepted": 3, "reached": 1, "cancelled": 1}))},
@@ -273,6 +277,14 @@ def test_traceback_with_any_bytes_reaches_the_end_of_the_run() -> None:
     outcome = msgspec.json.encode(ring.totals)
     assert msgspec.json.decode(outcome, type=EventTotals).errors[0].text == "no file ?"
     assert len(written) == 1
+
+
+def test_totals_have_the_expiry_of_a_pause_but_not_of_a_stream() -> None:
+    log: Any = SimpleNamespace(append=lambda *_: None)
+    ring = EventRing(log, SimpleNamespace(now_ns=int))  # type: ignore[arg-type]
+    for source in ("arm", "loop"):
+        ring.emit_event(source, EventBody(EventCode.STALE_COMMAND, Severity.WARNING, "ended"))
+    assert [one.source for one in ring.totals.errors] == ["loop"]
 
 
 # On virtual time

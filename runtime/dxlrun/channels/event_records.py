@@ -402,7 +402,7 @@ class EventTotals(msgspec.Struct, frozen=True):
     """Errors and goals of a run from its events, for the summary."""
 
     errors: tuple[EventGroup, ...] = ()
-    """Events that are errors, and takeovers that controllers requested, counted in groups."""
+    """Events that are errors, takeovers that controllers requested, and pauses that expired, in groups."""
     goals: GoalTotals | None = None
     """None: unknown, because the loop was killed before it could report them."""
     started_ns: int = 0
@@ -430,7 +430,8 @@ class EventRing:
         """Record an event with the current time; see `EventSink.emit_event`."""
         t_ns = self._clock.now_ns()
         code, severity, text = event
-        if severity >= Severity.ERROR or code == EventCode.TAKEOVER:
+        expired_pause = code == EventCode.STALE_COMMAND and source == "loop"
+        if severity >= Severity.ERROR or code == EventCode.TAKEOVER or expired_pause:
             self._errors.count_event(Event(t_ns, code, severity, source, _writable(text)))
         if code in _GOALS and data:
             self.goals.count_report(msgspec.json.decode(data, type=GoalReport))

@@ -170,9 +170,9 @@ class Steering:
         if 0 < self.paused_until_ns < record.woken_ns:
             self.resume_controllers()
             what = texts.PAUSE_ENDED
-            if not (ends := self._stale("no client ended the pause")):
-                commanding = manager.switching.commanding(record.layout.joints)
-                manager.switching.switch_controllers((), commanding)
+            if not (ends := self._stale(texts.PAUSE_EXPIRED)):
+                commanding = self._commanding()
+                manager.switching.switch_controllers((), commanding, why=texts.PAUSE_EXPIRED)
             self._context.events.emit_event("loop", texts.pause_expired(ends or what))
         for name in manager.stale(record.woken_ns) if manager.streams else ():
             if not (ends := self._stale(f"the stream of commands for {name} ended")):
@@ -255,12 +255,16 @@ class Steering:
         Returns: The refusal if the loop is not paused, else None.
         """
         if not self.paused:
-            return Refusal(Code.NOT_PAUSED)
+            return Refusal(Code.NOT_PAUSED, {} if self._commanding() else {"hint": texts.NOTHING_ACTIVE})
         self.paused_until_ns = 0
         self.anchoring.end_pause()
         self._gate.ease_in()
         self._set_cycle_limit()
         return None
+
+    def _commanding(self) -> tuple[str, ...]:
+        """Return the controllers that command joints."""
+        return self._manager.switching.commanding(self._record.layout.joints)
 
     def _set_cycle_limit(self) -> None:
         """Set the guardian's timeout of a cycle for the current period or pause, and send a heartbeat."""

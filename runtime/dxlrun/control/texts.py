@@ -92,7 +92,7 @@ def controller_restarted(because: str) -> str:
 
 @event_text(EventCode.STALE_COMMAND, Severity.WARNING)
 def pause_expired(consequence: str) -> str:
-    return f"no client ended the pause; {consequence}"
+    return f"{PAUSE_EXPIRED}; {consequence}"
 
 
 @event_text(EventCode.STALE_COMMAND, Severity.WARNING)
@@ -329,5 +329,7 @@ def lower_failed(controller: str) -> str:
 
 # Consequences of commands that do not come any more
 
+PAUSE_EXPIRED = "no client ended the pause"
 PAUSE_ENDED = "its controllers are deactivated, and the joints are held"
 JOINTS_HELD = "its joints are held"
+NOTHING_ACTIVE = "no controller commands its joints; activate one by `dxlrun switch --activate NAME`"

@@ -145,8 +145,8 @@ def run_verdict(run: RunSummary, plan: Plan) -> RunVerdict:
     faults = [one for one in events.errors if one.code == EventCode.CONTROLLER_FAULT]
     # Without a fallback, the fault ended the run.
     fell_back = [one for one in faults if one.source in fallbacks and run.reason != "fault"]
-    taken_over = [one for one in events.errors if one.code == EventCode.TAKEOVER]
-    errors = [one for one in events.errors if one not in (*fell_back, *taken_over)]
+    warnings = [one for one in events.errors if one.code in (EventCode.TAKEOVER, EventCode.STALE_COMMAND)]
+    errors = [one for one in events.errors if one not in (*fell_back, *warnings)]
     for code, what in _LOSSES.items():
         if of := [one for one in errors if one.code == code]:
             after_s = max(min(one.t_ns for one in of) - events.started_ns, 0) / 1e9
@@ -156,9 +156,10 @@ def run_verdict(run: RunSummary, plan: Plan) -> RunVerdict:
         happened.append(
             f"{named(one.source for one in fell_back)} failed, and a fallback controller took over"
         )
-    for one in taken_over:
+    for one in warnings:
         after_s = max(one.t_ns - events.started_ns, 0) / 1e9
-        happened.append(f"at {after_s:.1f} s {one.source} took over the robot: {last_line(one)}")
+        what = f"{one.source} took over the robot: " if one.code == EventCode.TAKEOVER else ""
+        happened.append(f"at {after_s:.1f} s {what}{last_line(one)}")
     ran_ns = (run.cycles + run.skipped) * loop.period_ns
     without = f" without {', '.join(plan.omitted)}" if plan.omitted else ""
     happened.append(f"ran for {ran_ns / 1e9:.1f} s{without}")

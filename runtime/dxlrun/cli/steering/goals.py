@@ -198,6 +198,8 @@ def show_goal_progress(
     raised again.
     """
     try:
+        if not chosen.as_json and robot.info()["paused"]:
+            print_warning(f"dxlrun: {robot.name} is paused; its goals wait until `dxlrun resume`")
         states = _ended(robot, numbers, motion, hidden=chosen.as_json)
     except KeyboardInterrupt:
         states = cancel_goals(robot, numbers)

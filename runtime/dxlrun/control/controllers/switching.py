@@ -91,7 +91,7 @@ class Switching:
         self._enter([name for name in lowers_first(names, known) if name in names], None, "")
 
     def switch_controllers(
-        self, activate: Sequence[str], deactivate: Sequence[str], number: int | None = None
+        self, activate: Sequence[str], deactivate: Sequence[str], number: int | None = None, why: str = ""
     ) -> Refusal | Acceptance | None:
         """Deactivate and activate controllers in one step, or refuse the whole switch.
 
@@ -102,6 +102,7 @@ class Switching:
             activate: Controllers to activate.
             deactivate: Controllers to deactivate. A controller in both lists restarts.
             number: Number of the client's command, for the result in `ended`; None: no command.
+            why: Reason for which goals are aborted; empty: the deactivation itself.
 
         Returns:
             None if the switch is complete, `Acceptance` if it waits for modes, or the refusal.
@@ -109,7 +110,7 @@ class Switching:
         step = self.standing.switch(activate, deactivate)
         if isinstance(step, Refusal):
             return step
-        return self._refuse_limp(step.enter) or self._execute_step(step, number)
+        return self._refuse_limp(step.enter) or self._execute_step(step, number, why)
 
     def execute_request(self, request: ControllerRequest) -> None:
         """Execute the request of an active controller: a takeover, or the end of the run after this cycle.
@@ -354,11 +355,11 @@ class Switching:
         Args:
             step: The controllers that leave and enter.
             number: Number of the client's command; None: no command.
-            why: Fault of the controller that is replaced; empty: the switch was requested.
+            why: Reason for the step, for aborted goals and failed activations; empty: it was requested.
         """
         for managed in (self.named[name] for name in step.leave):
             if managed.active:
-                self._deactivate(managed)
+                self._deactivate(managed, why)
                 continue
             self.modes_requested = False
             managed.on(ControllerEvent.LEAVE)
