@@ -29,7 +29,7 @@ controllers:
   head: {type: joint_group_position_controller, joints: [pan, tilt]}
   tail: {type: joint_group_position_controller, joints: [tilt], active: false}
 """
-INACTIVE = "head is not active; switch to it first"
+INACTIVE = "head is not active; activate it by `dxlrun switch --activate head`"
 STREAMED = send("head", "positions", 0.1, 0.1, lease_ns=50 * MS)
 COMMAND = send("head", "positions", 0.1, 0.1)
 HAND_OVER = switch(["tail"], ["head"])

@@ -149,7 +149,11 @@ def test_commands_to_controllers_that_are_not_there_are_refused_in_words(robot):
         robot.send(0, name, "go")
     assert robot.run(2).reason == "stopped"
     assert robot.events.of(EventCode.COMMAND_REFUSED) == [
-        ("asleep", "go from motion.yaml:7:5 refused: asleep is not active; switch to it first"),
+        (
+            "asleep",
+            "go from motion.yaml:7:5 refused: asleep is not active; "
+            "activate it by `dxlrun switch --activate asleep`",
+        ),
         ("unknown", "go from motion.yaml:7:5 refused: there is no controller unknown"),
     ]
 

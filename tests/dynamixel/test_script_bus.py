@@ -79,7 +79,9 @@ def test_servos_that_are_absent_or_of_another_model_are_refused(script):
         script.bus.servos({1: "XM430-W350", 2: "XL430-W250", 9: "XM430-W350"})
     kinds = {servo_id: one.kind for servo_id, one in caught.value.failures.items()}
     assert kinds == {2: "wrong_model", 9: "no_reply"}
-    assert str(caught.value).splitlines()[0] == "ID 2 on line is XM430-W350, not XL430-W250"
+    other, absent = str(caught.value).splitlines()
+    assert other == "ID 2 on line is XM430-W350, not XL430-W250"
+    assert absent.endswith("did not answer the ping; find its ID and baud rate by `dxlrun scan PORT`")
     with pytest.raises(LookupError, match="`dxlrun models` lists all"):
         script.bus.servos({1: "SG90"})
     with pytest.raises(LookupError, match="did you mean XL430-W250"):

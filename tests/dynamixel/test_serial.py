@@ -125,6 +125,8 @@ def test_a_missing_device_and_a_file_are_named(tmp_path):
     with pytest.raises(PortError, match=r"port /dev/ttyNOPE not found; (choose from /dev|plug in a serial)"):
         open_serial("/dev/ttyNOPE", 1_000_000)
     path = tmp_path / "file"
+    with pytest.raises(PortError, match=f"not found; check the path, .*`dxlrun sim --link {path}`"):
+        open_serial(str(path), 1_000_000)
     path.touch()
     with pytest.raises(PortError, match="is not a serial line"):
         open_serial(str(path), 1_000_000)

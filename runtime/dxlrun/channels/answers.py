@@ -45,7 +45,10 @@ class Code(StrEnum):
     # controllers
     UNKNOWN_CONTROLLER = "unknown_controller", "there is no controller {controller}"
     NAMED_TWICE = "named_twice", "{controller} is named twice; name it once"
-    NOT_ACTIVE = "not_active", "{controller} is not active; switch to it first"
+    NOT_ACTIVE = (
+        "not_active",
+        "{controller} is not active; activate it by `dxlrun switch --activate {controller}`",
+    )
     NOT_ACTIVE_YET = (
         "not_active_yet",
         "{controller} is not active yet; wait until its joints have changed their modes",

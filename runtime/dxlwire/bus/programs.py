@@ -107,6 +107,10 @@ def identify(
     for servo_id, expected in models.items():
         ping, reply = yield from identity(line, servo_id)
         if not reply.answered:
+            if reply.outcome is TransactionOutcome.TIMEOUT and reply is ping:
+                text = "did not answer the ping; find its ID and baud rate by `dxlrun scan PORT`"
+                failures[servo_id] = ServoFailure("no_reply", text)
+                continue
             asked = "the ping" if reply is ping else "the read of its model"
             failures[servo_id] = yield from _with_level(line, servo_id, failure_of(line, reply, asked))
             continue

@@ -182,7 +182,7 @@ def describe_failure(
     """Return a sentence with the reason why a device could not be opened, and the remedy."""
     number = error.errno
     if number in (errno.ENOENT, errno.ENODEV, errno.ENXIO):
-        return f"port {path} not found; {_what_exists()}"
+        return f"port {path} not found; {_what_exists(path)}"
     if number in (errno.EACCES, errno.EPERM) and not os.access(path, os.R_OK | os.W_OK):
         return (
             f"this user may not open {path}; run "
@@ -198,7 +198,9 @@ def describe_failure(
     return f"{path} cannot be opened: {error}"
 
 
-def _what_exists() -> str:
+def _what_exists(path: str) -> str:
+    if "/" in path and not os.path.abspath(path).startswith("/dev/"):
+        return f"check the path, or start the program that makes it, such as `dxlrun sim --link {path}`"
     devices = serial_devices()
     if not devices:
         return f"plug in a serial adapter; {help_link('there-is-no-port')}"
