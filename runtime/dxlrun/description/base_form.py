@@ -205,7 +205,7 @@ class ParametersModel(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, defer_build=True)
 
-    def mistakes(self) -> Iterator[Mistake]:
+    def mistakes(self) -> "Iterator[Mistake]":  # As text, so that the reference has the name
         """Yield mistakes in combinations of keys: the path of a key, and the text `problem; fix`.
 
         All of them are reported at once, each at its place in the robot file. Override this method for checks

@@ -2,9 +2,8 @@
 
 A feature is a package with files of fixed names. Each has an object `STAGE` of a class of this page:
 `Section` in `form.py`, `JointKey` in `joint_key.py`, `ServoKey` in `servo_key.py`, `PolicyKey` in
-`policy_key.py`, `PoseStage` in `pose_form.py`, `CompileStage` in `compile.py`,
-`SettingsStage` in `settings.py`,
-`LayerStage` in `layer.py`, `BusStage` in `runtime.py`, `MonitorStage` in `monitor.py`,
+`policy_key.py`, `PoseStage` in `pose_form.py`, `CompileStage` in `compile.py`, `SettingsStage` in
+`settings.py`, `LayerStage` in `layer.py`, `BusStage` in `runtime.py`, `MonitorStage` in `monitor.py`,
 `SafeStage` in `safe.py`, `ProcessStage` in `process.py`, `ReaderStage` in `reader.py`, `TableStage` in
 `table.py`. One of the first four is required. A small feature is one module with these objects in a tuple
 `STAGES`.
