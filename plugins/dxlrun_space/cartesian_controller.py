@@ -360,6 +360,9 @@ class CartesianController(Controller[CartesianParameters]):
 
     def _begin_task(self) -> None:
         """Begin what waits, from rest."""
+        streams = any(map(any, self._twist))
+        if self._is_trying and self._waiting is None and not streams:
+            return  # A twist of 0 does not replace a plan
         self._drop_plan("the arm moves; ask again when it rests")
         self._task, self._moves, self._brakes = None, False, False
         if self._is_cancelled:
@@ -367,7 +370,7 @@ class CartesianController(Controller[CartesianParameters]):
             self._end(Outcome.CANCELLED)
         if self._waiting is not None:
             self._task, self._waiting = self._pursue(self._waiting), None
-        elif any(map(any, self._twist)):
+        elif streams:
             self._task, self._moves = self._stream_twists(), True
 
     def _end(self, outcome: Outcome, text: str = "") -> None:

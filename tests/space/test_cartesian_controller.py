@@ -209,9 +209,13 @@ def test_a_plan_is_published_and_moves_nothing() -> None:
     for _ in range(2):
         stage.give("plan", rpy=(0, 0, 1.5), path="joints")  # sought in many cycles
         played(stage, 0.02)
+    stage.give("twist")  # of 0
+    played(stage, 9.0)
+    stage.give("plan", rpy=(0, 0, 1.5), path="joints")
     stage.send(None, "pose", dz=-0.05)
     texts = [plan.text for _, plan in stage.messages[count:]]
-    assert texts == ["replaced by a newer request", "the arm moves; ask again when it rests"]
+    assert texts[::2] == ["replaced by a newer request", "the arm moves; ask again when it rests"]
+    assert texts[1].endswith("deg from the orientation, which the arm cannot reach")
 
 
 def test_each_plan_is_answered_with_its_own_coordinates() -> None:
