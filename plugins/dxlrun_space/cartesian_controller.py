@@ -361,7 +361,7 @@ class CartesianController(Controller[CartesianParameters]):
     def _begin_task(self) -> None:
         """Begin what waits, from rest."""
         streams = any(map(any, self._twist))
-        if self._is_trying and self._waiting is None and not streams:
+        if self._tried is not None and self._waiting is None and not streams:
             return  # A twist of 0 does not replace a plan
         self._drop_plan("the arm moves; ask again when it rests")
         self._task, self._moves, self._brakes = None, False, False
