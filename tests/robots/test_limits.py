@@ -1,4 +1,4 @@
-"""A joint beyond its limit is driven back, also behind the end of a run; other limits: stories/limits.txt."""
+"""A joint beyond its limit is driven back, also after its run; others: run/stories/joint_limits.txt."""
 
 import itertools
 import math
