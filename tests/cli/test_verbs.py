@@ -131,9 +131,12 @@ def test_verb_whose_package_is_absent_names_the_line_that_installs_it(
     dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch, verb: str, package: str, place: str
 ) -> None:
     monkeypatch.setattr(verb_registry, "packaged", dict)
-    said = dxlrun(verb, "run.mcap")
-    assert said.code == 2
-    assert said.errors == [
-        f"dxlrun: `dxlrun {verb}` needs the package {package}, whose import failed; "
-        f"run `pip install {place}` in a clone of dxlrun"
-    ]
+    for problem, spec in (("which is not installed", None), ("whose import failed", "broken")):
+        monkeypatch.setattr(verb_registry, "find_spec", lambda _, spec=spec: spec)
+        for words in ([verb, "run.mcap"], [verb, "--robot", "c"], [verb, "c", "--open"], [verb, "--help"]):
+            said = dxlrun(*words)
+            assert said.code == 2
+            assert said.errors == [
+                f"dxlrun: `dxlrun {verb}` needs the package {package}, {problem}; "
+                f"run `pip install {place}` in a clone of dxlrun"
+            ]

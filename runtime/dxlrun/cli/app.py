@@ -208,10 +208,16 @@ def _refuse(
 
 
 def _refuse_other_words(tokens: Sequence[str]) -> None:
-    """Raise InputError, with the right command line, when the first word is a command of another program."""
+    """Raise InputError, with the right command line, when the first word is a command of another program.
+
+    The command of an absent package is refused here, because its options are not known.
+    """
     word = tokens[0] if tokens else ""
+    if Path(word).exists():
+        return
+    verb_registry.require_package(word)
     verb = verb_registry.verb_for(word)
-    if verb is None or word in verb_registry.names() or Path(word).exists():
+    if verb is None or word in verb_registry.names():
         return
     given = [*verb.split(), *_without_output(tokens[1:])]
     line = shlex.join(("dxlrun", *given)) if given else "dxlrun ROBOT.yaml"

@@ -228,11 +228,7 @@ def known_file(robot: Path) -> None:
         raise InputError(f"{word} is a directory; give the robot file in it")
     if robot.suffix in (".yaml", ".yml") or len(robot.parts) > 1:
         raise InputError(f"robot file {word} not found; {_other_file(robot)}")
-    if package := verb_registry.package_of(word):
-        raise InputError(
-            f"`dxlrun {word}` needs the package {package}, whose import failed; run `pip install "
-            f"{verb_registry.source_of(package)}` in a clone of dxlrun"
-        )
+    verb_registry.require_package(word)
     if (named := robot.with_suffix(".yaml")).is_file():
         raise InputError(f"file {word} not found; write `{named}`")
     if is_example(robot.name):

@@ -7,9 +7,11 @@ from collections.abc import Mapping
 from contextlib import suppress
 from functools import cache
 from importlib import import_module
+from importlib.util import find_spec
 from itertools import chain
 from typing import TYPE_CHECKING
 
+from dxlrun.errors import InputError
 from dxlrun.installed_plugins import InstalledPlugin, installed_plugins
 
 if TYPE_CHECKING:
@@ -149,6 +151,16 @@ def is_importable(command: Command) -> bool:
 def names() -> list[str]:
     """Return the verbs of core and installed packages in alphabetical order."""
     return sorted({*chain(*GROUPS.values()), *packaged()})
+
+
+def require_package(verb: str) -> None:
+    """Raise InputError when a verb belongs to a package of this repository that is absent or broken."""
+    if (package := package_of(verb)) and verb not in packaged():
+        problem = "which is not installed" if find_spec(package) is None else "whose import failed"
+        raise InputError(
+            f"`dxlrun {verb}` needs the package {package}, {problem}; "
+            f"run `pip install {source_of(package)}` in a clone of dxlrun"
+        )
 
 
 def package_of(verb: str) -> str:
