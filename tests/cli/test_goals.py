@@ -17,7 +17,7 @@ from dxlrun.cli.steering import goals, parameters, steer
 from dxlrun.cli.steering import play as play_room
 from dxlrun.errors import DxlrunError, Refused
 from dxlrun.remote.client import Executed, RemoteGoal
-from dxlrun.remote.requests.replies import GoalState, Parameter
+from dxlrun.remote.requests.replies import GoalState, Parameter, TopicState
 
 ENDS: dict[str, dict[str, Any]] = {
     "running": {},
@@ -57,6 +57,7 @@ class Robot:
         self.file = Path("/nowhere/torso.yaml")
         self.omitted: list[str] = []
         self.paused = False
+        self.answers: list[str] = []
 
     def __enter__(self) -> Robot:
         return self
@@ -121,6 +122,9 @@ class Robot:
         facts = {"file": str(self.file), "groups": {}, "controllers": controllers, "paused": self.paused}
         return facts | omitted
 
+    def topics(self) -> list[TopicState]:
+        return [TopicState(name, "", (), 0, None) for name in self.answers]
+
     def goals(self) -> list[GoalState]:
         return [states[0] for states in self.script.values() if isinstance(states[0], GoalState)]
 
@@ -178,6 +182,7 @@ def test_goal_at_the_terminal(dxlrun: Dxlrun, robot: Robot, reader: Path, case: 
         "begun": robot.begin,
         "refused": robot.refuse,
         "omits": robot.omitted.append,
+        "topic": robot.answers.append,
         "paused": lambda _: setattr(robot, "paused", True),
         "no": lambda _: setattr(robot, "goals_begin", False),
         "at": lambda _: setattr(robot, "file", reader / "torso.yaml"),

@@ -95,7 +95,8 @@ def test_what_is_typed_is_answered(dxlrun, torso: Torso, case: Case) -> None:
 def test_send_moves_the_joints_that_are_named_with_units_by_one_request(dxlrun, torso: Torso) -> None:
     said = dxlrun("send", "head", "posvel", "positions=[20 deg, -30 deg]", "velocities=[1 rad/s, 30 rpm]")
     assert said == (0, "bioloid_torso: head accepted posvel\n", "")
-    assert torso.asked == ["POST /controllers/head/commands/posvel?units=true"]
+    asked = ["POST /controllers/head/commands/posvel?units=true", "GET /topics"]
+    assert torso.asked == asked
     goals = [torso.goal(joint) for joint in ("head_yaw_joint", "head_pitch_joint")]
     assert goals == pytest.approx([-0.5236, 0.3491], abs=0.003)
 

@@ -416,7 +416,10 @@ class Controller(ABC, Generic[P]):
     Goals: ClassVar[frozenset[str]] = frozenset()
     """Kinds in `Commands` that are goals: passed to `on_goal`, cancellable, with an outcome."""
     Topics: ClassVar[Mapping[str, type]] = {}
-    """Message classes of the controller's own topics, by topic name: dataclasses, see dxlrun.messages."""
+    """Message classes of the controller's own topics, by topic name: dataclasses, see dxlrun.messages.
+
+    A topic with the name of a command has the answers to that command.
+    """
     publishes: ClassVar[tuple[str, ...]] = ()
     """Topics of the log that are written in the cycles that it marks: `/joint_states`."""
     keeps: ClassVar[bool] = False

@@ -28,7 +28,7 @@ def speed_out_of_range(speed: float, lowest: float, highest: float) -> str:
 
 
 def duration_out_of_range(seconds: float, longest_s: float) -> str:
-    return f"in={seconds:g} is out of range; write a time above 0 s, at most {longest_s:g} s"
+    return f"a duration of {seconds:g} s is out of range; write a time above 0 s, at most {longest_s:g} s"
 
 
 def no_body(error: object, example: str) -> str:
@@ -99,7 +99,7 @@ def takes_no_time(controller: str) -> str:
 
 
 def has_own_times(controller: str, kind: str) -> str:
-    return f"{kind} of {controller} contains its own times; omit in="
+    return f"{kind} of {controller} contains its own times; omit the duration"
 
 
 def value_not_finite(controller: str, kind: str, joint: str, value: object) -> str:

@@ -33,7 +33,7 @@ def send(
     /,
     *words: Words,
     file: Path | None = None,
-    in_: Annotated[str | None, Parameter(name="--in")] = None,
+    in_: Annotated[str | None, Parameter(name="--in", allow_leading_hyphen=True)] = None,
     wait: WaitFlag = False,
     chosen: RobotChoice = ONLY_ONE,
 ) -> int:
@@ -93,12 +93,23 @@ def send(
         if not wait:
             as_goal = "" if done.goal is None else f" as goal {done.goal.number}"
             what = " ".join(words) if for_device else kind
-            return report_done(robot, chosen, done, f"{robot.name}: {controller} accepted {what}{as_goal}")
+            sentence = f"{robot.name}: {controller} accepted {what}{as_goal}"
+            if done.goal is None and (topic := _answer_topic(robot, controller, kind)):
+                sentence += f"; see the answer by `dxlrun echo {topic} --count 1`"
+            return report_done(robot, chosen, done, sentence)
         if done.goal is None:
+            topic = _answer_topic(robot, controller, kind)
+            answer = f", and see the answer by `dxlrun echo {topic} --count 1`" if topic else ""
             raise DxlrunError(
-                f"{controller} accepted {kind}, but this command has no end to wait for; omit --wait"
+                f"{controller} accepted {kind}, but this command has no end to wait for; omit --wait{answer}"
             )
         return show_goal_progress(robot, chosen, done, [done.goal.number])
+
+
+def _answer_topic(robot: RemoteRobot, controller: str, kind: str) -> str:
+    """Return the controller's topic with the name of a command, which has its answers; empty without one."""
+    topic = f"/{controller}/{kind}"
+    return topic if any(one.name == topic for one in robot.topics()) else ""
 
 
 def _name_key(robot: RemoteRobot, controller: str, kind: str) -> str:
@@ -270,6 +281,7 @@ def _cancel_once(robot: RemoteRobot, numbers: Sequence[int], *, again: bool = Fa
         # The goal has ended in the meantime, or is already being cancelled.
         except Refused as refused:
             if again and refused.code == Code.CANCELLED_ALREADY:
+                print_warning(f"dxlrun: {refused}")
                 continue
         except DxlrunError as error:
             print_error(f"dxlrun: {error}")
