@@ -44,7 +44,7 @@ TESTED = {
     "phidget": ("phidget",),
     "plugins": ("dxlrun_controllers", "dxlrun_space", "dxlrun.contract", "dxlrun.testing", "example", "docs"),
     "remote": ("dxlrun.remote", "dxlrun.channels"),
-    "robots": ("robots", "dxlrun_controllers", "dxlrun.control", "dxlrun.run"),
+    "robots": ("robots", "dxlrun_controllers", "dxlrun.control", "dxlrun.run", "dxlrun.features.mechanics"),
     "ros2": ("dxlrun_ros2",),
     "run": ("dxlrun.run", "dxlrun.channels", "dxlrun.control"),
     "sensors": ("dxlrun.features.sensors",),
