@@ -223,7 +223,7 @@ def test_boards_are_read_in_si_units(robot):
     assert [values[f"cr/button.{each}"] for each in ("mode", "start", "user", "reset")] == [0, 0, 1, 0]
     assert (values["mine/toe"], values["mine/go"], values["mine/halt"]) == (pytest.approx(-3.5), 0, 1)
     assert run.plan.included["boards/mine.toml"] == BOARD
-    assert run.events.errors == ()
+    assert run.events.named == ()
 
 
 def test_a_board_that_waits_in_a_chain_is_read_alone_and_asked_again_at_the_start(robot):
@@ -233,7 +233,7 @@ def test_a_board_that_waits_in_a_chain_is_read_alone_and_asked_again_at_the_star
     chain = bytes.fromhex("fffffd00fe0d00920984000400c81f000100")
     other_host(bus, chain + crc16.umts(chain).to_bytes(2, "little"), bus.now_ns, received=False)
     run.run()
-    assert run.events.errors == ()
+    assert run.events.named == ()
     assert run.record.sources.valid.all()
     notes = [entry.note for entry in bus.ledger.entries]
     assert "device 200: ignores instructions until 9 has replied" in notes

@@ -399,10 +399,10 @@ class EventCounts:
 
 
 class EventTotals(msgspec.Struct, frozen=True):
-    """Errors and goals of a run from its events, for the summary."""
+    """Events and goals of a run that its summary names."""
 
-    errors: tuple[EventGroup, ...] = ()
-    """Events that are errors, takeovers that controllers requested, and pauses that expired, in groups."""
+    named: tuple[EventGroup, ...] = ()
+    """Errors, and two kinds of warnings: takeovers that controllers requested, and pauses that expired."""
     goals: GoalTotals | None = None
     """None: unknown, because the loop was killed before it could report them."""
     started_ns: int = 0
@@ -412,19 +412,19 @@ class EventTotals(msgspec.Struct, frozen=True):
 class EventRing:
     """Event sink that appends the events of a process to its ring. Never blocks and never raises."""
 
-    __slots__ = ("_clock", "_errors", "_started_ns", "_writer", "goals")
+    __slots__ = ("_clock", "_named", "_started_ns", "_writer", "goals")
 
     def __init__(self, writer: Appender, clock: Clock) -> None:
         self._writer = writer
         self._clock = clock
-        self._errors = EventCounts()
+        self._named = EventCounts()
         self.goals = GoalHistory()
         self._started_ns = 0
 
     @property
     def totals(self) -> EventTotals:
-        """Errors and goals of the events so far."""
-        return EventTotals(self._errors.groups, self.goals.totals, self._started_ns)
+        """Events and goals so far that the summary names."""
+        return EventTotals(self._named.groups, self.goals.totals, self._started_ns)
 
     def emit_event(self, source: str, event: EventBody, data: bytes = b"") -> None:
         """Record an event with the current time; see `EventSink.emit_event`."""
@@ -432,7 +432,7 @@ class EventRing:
         code, severity, text = event
         expired_pause = code == EventCode.STALE_COMMAND and source == "loop"
         if severity >= Severity.ERROR or code == EventCode.TAKEOVER or expired_pause:
-            self._errors.count_event(Event(t_ns, code, severity, source, _writable(text)))
+            self._named.count_event(Event(t_ns, code, severity, source, _writable(text)))
         if code in _GOALS and data:
             self.goals.count_report(msgspec.json.decode(data, type=GoalReport))
         elif code == EventCode.LOOP_STARTED:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import msgspec
 
-from dxlrun.channels.event_records import EventCode, EventGroup, EventTotals
+from dxlrun.channels.event_records import EventCode, EventGroup, EventTotals, Severity
 from dxlrun.dynamixel.remedies import free_machine
 from dxlrun.errors import counted
 from dxlrun.output.terminal import live_line, show_parts
@@ -142,11 +142,11 @@ def run_verdict(run: RunSummary, plan: Plan) -> RunVerdict:
     while above := {one.name for one in loop.controllers if fallbacks & {*one.into}} - fallbacks:
         # The controllers below a failed controller fail with it.
         fallbacks |= above
-    faults = [one for one in events.errors if one.code == EventCode.CONTROLLER_FAULT]
+    faults = [one for one in events.named if one.code == EventCode.CONTROLLER_FAULT]
     # Without a fallback, the fault ended the run.
     fell_back = [one for one in faults if one.source in fallbacks and run.reason != "fault"]
-    warnings = [one for one in events.errors if one.code in (EventCode.TAKEOVER, EventCode.STALE_COMMAND)]
-    errors = [one for one in events.errors if one not in (*fell_back, *warnings)]
+    warnings = [one for one in events.named if one.severity < Severity.ERROR]
+    errors = [one for one in events.named if one not in (*fell_back, *warnings)]
     for code, what in _LOSSES.items():
         if of := [one for one in errors if one.code == code]:
             after_s = max(min(one.t_ns for one in of) - events.started_ns, 0) / 1e9
