@@ -34,9 +34,9 @@ STEPS: Final = 20
 SAMPLES: Final = 2000
 """Positions whose poses are known beforehand. A search begins at those with the nearest poses."""
 STARTS: Final = 160
-"""Starts for position and orientation; of 10,000 poses in reach of six joints, one needed 116."""
-PLACES: Final = 3
-"""Starts for the position alone."""
+"""Starts for position and orientation; of 6,000 poses in reach of six joints, one needed 116."""
+PLACES: Final = 8
+"""Starts for the position alone, each to its end: of 6,000 poses out of reach, some have a nearer one."""
 _NEAR: Final = 0.05
 """Position error, as a fraction of the length, within which orientations are tried."""
 _FAILING: Final = 0.8
@@ -194,7 +194,7 @@ class Solver:
         for each in self._nearest(target, lever, count):
             if best.residual.is_close if lever else best.residual.position <= CLOSE_M:
                 return best
-            found = yield from self._descend(target, each, lever, is_patient=False)
+            found = yield from self._descend(target, each, lever, is_patient=not lever)
             best = min(best, found, key=lambda one: one.cost)
         return (yield from self._descend(target, best.positions, lever, 5 * STEPS))
 
