@@ -45,7 +45,9 @@ def with_groups(grown: PlainDocument) -> PlainDocument:
     layers = [_layer(grown, (DEFAULTS,), tuple(_mapping(data.get("joints"))), groups)]
     layers += [_layer(grown, (GROUPS, name), joints, groups) for name, joints in groups.items()]
     grown = replace(grown, problems=(*grown.problems, *_disagreements(grown, groups, layers[1:])))
-    return put_in(merged([*layers, _without_defaults(grown, groups)]), groups)
+    own = _without_defaults(grown, groups)
+    # Layers would make joints, which then would not be reported as missing.
+    return put_in(merged([*layers, own] if "joints" in data else [own]), groups)
 
 
 def put_in(grown: PlainDocument, groups: Groups) -> PlainDocument:
