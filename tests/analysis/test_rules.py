@@ -1,4 +1,4 @@
-"""Rules of the verdict on totals: whom it may accuse, on what evidence and in what words; see totals.txt."""
+"""Rules of the verdict on totals: the culprit that they name, and their evidence. Their words: totals.txt."""
 
 import ast
 import re

@@ -269,10 +269,14 @@ def test_controller_with_a_fallback_may_fail(torso: Path) -> None:
     assert (verdict.exit_code, "fallback" in verdict.line) == (1, False)
 
 
+def event_ring(append: Callable[[object, bytes], None]) -> EventRing:
+    log: Any = SimpleNamespace(append=append, now_ns=int)
+    return EventRing(log, log)
+
+
 def test_traceback_with_any_bytes_reaches_the_end_of_the_run() -> None:
     written: list[bytes] = []
-    log: Any = SimpleNamespace(append=lambda _, data: written.append(data))
-    ring = EventRing(log, SimpleNamespace(now_ns=int))  # type: ignore[arg-type]
+    ring = event_ring(lambda _, data: written.append(data))
     ring.emit_event("arm", EventBody(EventCode.CONTROLLER_FAULT, Severity.ERROR, "no file \udcff"))
     outcome = msgspec.json.encode(ring.totals)
     assert msgspec.json.decode(outcome, type=EventTotals).named[0].text == "no file ?"
@@ -280,8 +284,7 @@ def test_traceback_with_any_bytes_reaches_the_end_of_the_run() -> None:
 
 
 def test_totals_have_the_expiry_of_a_pause_but_not_of_a_stream() -> None:
-    log: Any = SimpleNamespace(append=lambda *_: None)
-    ring = EventRing(log, SimpleNamespace(now_ns=int))  # type: ignore[arg-type]
+    ring = event_ring(lambda *_: None)
     for source in ("arm", "loop"):
         ring.emit_event(source, EventBody(EventCode.STALE_COMMAND, Severity.WARNING, "ended"))
     assert [one.source for one in ring.totals.named] == ["loop"]

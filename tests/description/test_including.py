@@ -1,5 +1,5 @@
 # ruff: noqa: E501 (a mistake and its sentence are read best side by side)
-"""What is put into robot files, each value with its place; what is wrong: arguments.txt, included.txt."""
+"""Arguments and included files: values with their places. Mistakes: arguments.txt, included.txt."""
 
 import functools
 import json

@@ -278,11 +278,10 @@ def story_parameters(folder: Path) -> Iterator[Any]:
 def variants(told: Sequence[Line]) -> Iterator[tuple[str, Sequence[Line]]]:
     """Yield the lines of a case for each text that its names stand for."""
     named = [re.match(r"([A-Z]+(?: [A-Z]+)*) = (.*)", line.text) for line in told]
-    first = next((place for place, one in enumerate(named) if one), None)
-    if first is None:
+    names = next((one[1] for one in named if one), None)
+    if names is None:
         yield "", told
         return
-    names = named[first][1]  # type: ignore[index]  # the place is that of a match
     texts = [text for one in named if one and one[1] == names for text in one[2].split(" | ")]
     others = [line for line, one in zip(told, named, strict=True) if not one or one[1] != names]
     for text in texts:

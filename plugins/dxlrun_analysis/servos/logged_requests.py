@@ -55,7 +55,7 @@ class DistinctRequests(NamedTuple):
     blocks: Numbers = np.zeros((0, 0), np.int64)
     """Offset of each block in the common status packet of a fast read, shape (requests, blocks)."""
     block_ends: Numbers = np.zeros((0, 0), np.int64)
-    """Offset of the first byte after each block, beyond any packet if there is no such block."""
+    """Offset of the first byte after each block; for a block that is absent, beyond any packet."""
 
     def and_more(self, kinds: tuple[LoggedRequest, ...]) -> DistinctRequests:
         """Return a copy of the table with requests appended."""

@@ -90,26 +90,22 @@ def send(
                 what = f"{controller} is a controller: name one of its commands ({known}) before {words[0]!r}"
                 raise InputError(what) from None
             raise written.located(refused) from None
-        if not wait:
-            as_goal = "" if done.goal is None else f" as goal {done.goal.number}"
-            what = " ".join(words) if for_device else kind
-            sentence = f"{robot.name}: {controller} accepted {what}{as_goal}"
-            if done.goal is None and (topic := _answer_topic(robot, controller, kind)):
-                sentence += f"; see the answer by `dxlrun echo {topic} --count 1`"
-            return report_done(robot, chosen, done, sentence)
-        if done.goal is None:
-            topic = _answer_topic(robot, controller, kind)
-            answer = f", and see the answer by `dxlrun echo {topic} --count 1`" if topic else ""
+        if wait and done.goal is not None:
+            return show_goal_progress(robot, chosen, done, [done.goal.number])
+        rest = _answer_hint(robot, controller, kind) if done.goal is None else f" as goal {done.goal.number}"
+        if wait:
             raise DxlrunError(
-                f"{controller} accepted {kind}, but this command has no end to wait for; omit --wait{answer}"
+                f"{controller} accepted {kind}, but this command has no end to wait for; omit --wait{rest}"
             )
-        return show_goal_progress(robot, chosen, done, [done.goal.number])
+        what = " ".join(words) if for_device else kind
+        return report_done(robot, chosen, done, f"{robot.name}: {controller} accepted {what}{rest}")
 
 
-def _answer_topic(robot: RemoteRobot, controller: str, kind: str) -> str:
-    """Return the controller's topic with the name of a command, which has its answers; empty without one."""
+def _answer_hint(robot: RemoteRobot, controller: str, kind: str) -> str:
+    """Return how to see the answer to a command: a topic with its name has it. Empty without this topic."""
     topic = f"/{controller}/{kind}"
-    return topic if any(one.name == topic for one in robot.topics()) else ""
+    has_answers = any(one.name == topic for one in robot.topics())
+    return f"; see the answer by `dxlrun echo {topic} --count 1`" if has_answers else ""
 
 
 def _name_key(robot: RemoteRobot, controller: str, kind: str) -> str:
@@ -119,10 +115,11 @@ def _name_key(robot: RemoteRobot, controller: str, kind: str) -> str:
     if not found:
         return "name="  # The gateway refuses an unknown controller, whatever the keys are
     fields = found[0].get(kind, {}).get("properties", {})
-    for key, field in [*fields.items()][:1]:
-        if any(each.get("type") == "string" for each in field.get("anyOf", [field])):
-            return f"{key}="
-    return ""
+    if not fields:
+        return ""
+    key, field = next(iter(fields.items()))
+    is_name = any(each.get("type") == "string" for each in field.get("anyOf", [field]))
+    return f"{key}=" if is_name else ""
 
 
 def cancel(goal: str = "", /, *, wait: WaitFlag = False, chosen: RobotChoice = ONLY_ONE) -> int:
