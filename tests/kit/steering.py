@@ -64,11 +64,15 @@ class ScriptedParameters(dxlrun.ParametersModel):
 
 
 class Scripted(dxlrun.Controller[ScriptedParameters]):
-    """Commands its own value or what is commanded of it; its goal `move` takes so many updates."""
+    """Commands its own value or what is commanded of it; its goal `move` takes so many updates.
+
+    The second value of `move` and `plan` is the number of updates after which it is aborted.
+    """
 
     Parameters = ScriptedParameters
-    Commands: ClassVar = {"go": Go, "move": Go}
-    Goals: ClassVar = frozenset({"move"})
+    Commands: ClassVar = {"go": Go, "move": Go, "plan": Go}
+    Goals: ClassVar = frozenset({"move", "plan"})
+    plans: ClassVar = frozenset({"plan"})
     story: ClassVar[Any] = None
 
     @classmethod
@@ -100,7 +104,15 @@ class Scripted(dxlrun.Controller[ScriptedParameters]):
 
     def on_goal(self, goal: Any, data: Any, time_ns: int) -> None:
         self.goal, self.left = goal, int(data[0])
+        self.fails = int(data[1]) if len(data) > 1 else -1
         self._step("goal")
+        self._abort_due()
+
+    def _abort_due(self) -> None:
+        if self.fails == 0 and self.goal is not None:
+            self.goal.end(dxlrun.Outcome.ABORTED, "out of reach")
+            self.goal = None
+        self.fails -= 1
 
     def on_cancel(self, goal: Any, time_ns: int) -> None:
         self.left = -2  # it comes to rest two updates later
@@ -115,6 +127,8 @@ class Scripted(dxlrun.Controller[ScriptedParameters]):
                 np.copyto(commands, given, where=np.isfinite(given))
             elif self.own is not None:
                 commands[:] = self.own
+        if self.goal is not None:
+            self._abort_due()
         if self.goal is not None:
             self.left += 1 if self.left < 0 else -1
             if self.left in (0, -1):

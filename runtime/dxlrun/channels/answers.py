@@ -78,6 +78,7 @@ class Code(StrEnum):
     GOAL_ENDED = "goal_ended", "goal {goal} has ended already: {outcome}"
     CANCELLED_ALREADY = "cancelled_already", "goal {goal} is being cancelled already"
     NO_GOAL = "no_goal", "{controller} has no goal"
+    GOAL_REFUSED = "goal_refused", "{kind} of {controller}: {problem}"
     GOAL_STREAMED = "goal_streamed", "{kind} of {controller} is a goal; send it once, not in a stream"
     NOT_LIVE = "not_live", "{parameter} of {controller} cannot be changed in a run; {known}"
     UNKNOWN_PARAMETER = "unknown_parameter", "{controller} has no parameter {parameter}"
@@ -187,7 +188,8 @@ class Completion(msgspec.Struct, frozen=True, tag="done"):
 class Acceptance(msgspec.Struct, frozen=True, tag="waiting"):
     """Answer: the command was accepted, but is not complete; another answer follows.
 
-    Controllers may wait for the modes of their joints. Torque requests and reboots use idle time.
+    Controllers may wait for the modes of their joints, or plan a goal. Torque requests and reboots use idle
+    time.
     """
 
     controllers: tuple[str, ...]

@@ -415,6 +415,9 @@ class Controller(ABC, Generic[P]):
     """Models of the commands that the controller accepts, by kind."""
     Goals: ClassVar[frozenset[str]] = frozenset()
     """Kinds in `Commands` that are goals: passed to `on_goal`, cancellable, with an outcome."""
+    plans: ClassVar[frozenset[str]] = frozenset()
+    """Kinds in `Goals` that are planned over several updates before a joint moves. Their clients are answered
+    at the first `Goal.feedback` or `Goal.judge`, after 5 s at the latest."""
     Topics: ClassVar[Mapping[str, type]] = {}
     """Message classes of the controller's own topics, by topic name: dataclasses, see dxlrun.messages.
 
@@ -526,7 +529,11 @@ class Controller(ABC, Generic[P]):
         """Execute a prepared command at the start of a cycle. `data` does not change during the run."""
 
     def on_goal(self, goal: Goal, data: NDArray[np.float64], time_ns: int) -> None:
-        """Start a goal from a prepared command of `goal.kind`. The previous goal was preempted."""
+        """Start a goal from a prepared command of `goal.kind`. The previous goal was preempted.
+
+        A goal that is aborted here is refused: its client gets the text of `goal.end` as the answer. The same
+        applies to a goal of `plans` that is aborted before its client is answered.
+        """
 
     def on_cancel(self, goal: Goal, time_ns: int) -> None:
         """Bring the joints to rest, and call `goal.end` then, in this call or in a later update."""

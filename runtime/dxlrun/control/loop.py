@@ -247,7 +247,7 @@ class ControlLoop:
             record.commands.clear()
         else:
             manager.update(cycle - self._paused_cycles)
-        if manager.switching.ended:
+        if manager.switching.ended or steering.planned:
             steering.answer_late()
 
     def _wind_up(self, name: str) -> Last:

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 
 import msgspec
 
-from dxlrun.channels.answers import Answer, Code, CommandOutcome, Completion, Refusal
+from dxlrun.channels.answers import Acceptance, Answer, Code, CommandOutcome, Completion, Refusal
 from dxlrun.channels.commands import LOOP, CommandMessage, TakenCommand
 from dxlrun.channels.event_records import StreamEnd
 from dxlrun.channels.loop_requests import (
@@ -25,10 +25,11 @@ from dxlrun.channels.loop_requests import (
     TorqueRequest,
     Unload,
 )
+from dxlrun.contract.controller import Outcome
 from dxlrun.control import texts
 from dxlrun.control.anchoring import Anchoring
 from dxlrun.control.context import ControlContext
-from dxlrun.control.controllers.goal_registry import PlayedPart
+from dxlrun.control.controllers.goal_registry import PlayedPart, RunningGoal
 from dxlrun.control.controllers.manager import Manager
 from dxlrun.control.gate import Gate
 from dxlrun.control.halt import Halt
@@ -47,6 +48,8 @@ PAUSE_LEASE_NS = 60_000_000_000
 PAUSED_CYCLE_NS = 200_000_000
 """Guardian's timeout of a cycle while the loop is paused. It is longer because a cycle may load a
 controller."""
+LONGEST_PLANNING_NS = 5_000_000_000
+"""Longest wait for a controller that plans a goal; shorter than the gateway's timeout of a late answer."""
 LONGEST_SHOWN = 120
 """Number of characters after which the text of a command is cut in its event."""
 
@@ -90,8 +93,9 @@ class Steering:
     """Executes, logs and answers the commands of an inbox, and controls the loop's rate and pauses.
 
     Most commands are answered in the cycle that executes them. A switch that waits for modes is first
-    answered with `Acceptance`, and again when its controllers are active or dropped. Torque requests, reboots
-    and halts are answered twice in the same way. A register is answered when the servo has responded.
+    answered with `Acceptance`, and again when its controllers are active or dropped. Torque requests,
+    reboots, halts, and goals that are planned, are answered twice in the same way. A register is answered
+    when the servo has responded.
     """
 
     def __init__(
@@ -110,6 +114,8 @@ class Steering:
         """
         self.stood = False
         """True in cycles of a pause and in the cycle that ends the pause. These cycles may be long."""
+        self.planned: dict[int, RunningGoal] = {}
+        """Goals whose controllers plan them, by number of the command that waits for its second answer."""
         self._context = context
         self._record = context.record
         self._supervision = context.supervision
@@ -130,7 +136,7 @@ class Steering:
             commands: Commands from the inbox.
 
         Returns:
-            Number of accepted commands for controllers.
+            Number of commands that controllers got.
         """
         count = 0
         record, manager = self._record, self._manager
@@ -153,33 +159,43 @@ class Steering:
                 )
             )
             answer: Answer | None
-            words = ""
-            if for_loop := command.controller == LOOP:
+            if command.controller == LOOP:
                 answer, words = self._for_loop(command)
-            else:
-                found = manager.dispatch_command(command)
-                goals = (found,) if isinstance(found, int) and found else ()
-                answer = found if isinstance(found, Refusal) else Completion(record.cycle, goals=goals)
-            if for_loop or isinstance(answer, Refusal):
                 self._report_command(command, answer, place, words)
-            if for_loop and self.paused:
-                self.paused_until_ns = record.woken_ns + PAUSE_LEASE_NS
-            count += not (for_loop or isinstance(answer, Refusal))
+                if self.paused:
+                    self.paused_until_ns = record.woken_ns + PAUSE_LEASE_NS
+            elif isinstance(found := manager.dispatch_command(command), Refusal):
+                answer = found
+                self._report_command(command, answer, place, "")
+            else:
+                answer = Completion(record.cycle) if found is None else self._goal_answer(found)
+                if found is not None and isinstance(answer, Acceptance):
+                    self.planned[command.number] = found
+                count += 1
             if answer is not None:
                 self.inbox.answer_command(command.number, answer)
         if 0 < self.paused_until_ns < record.woken_ns:
-            self.resume_controllers()
-            what = texts.PAUSE_ENDED
-            if not (ends := self._stale(texts.PAUSE_EXPIRED)):
-                commanding = self._commanding()
-                manager.switching.switch_controllers((), commanding, why=texts.PAUSE_EXPIRED)
-            self._context.events.emit_event("loop", texts.pause_expired(ends or what))
-        for name in manager.stale(record.woken_ns) if manager.streams else ():
+            self._expire_pause()
+        if manager.streams:
+            self._end_streams()
+        return count
+
+    def _expire_pause(self) -> None:
+        """End a pause whose lease expired, by the policy `on_stale_command`."""
+        self.resume_controllers()
+        what = texts.PAUSE_ENDED
+        if not (ends := self._stale(texts.PAUSE_EXPIRED)):
+            switching = self._manager.switching
+            switching.switch_controllers((), self._commanding(), why=texts.PAUSE_EXPIRED)
+        self._context.events.emit_event("loop", texts.pause_expired(ends or what))
+
+    def _end_streams(self) -> None:
+        """End the command streams whose lease expired, by the policy `on_stale_command`."""
+        for name in self._manager.stale(self._record.woken_ns):
             if not (ends := self._stale(f"the stream of commands for {name} ended")):
-                manager.hold_controller(name)
+                self._manager.hold_controller(name)
             event, data = texts.stream_expired(ends or texts.JOINTS_HELD), StreamEnd(held=not ends)
             self._context.events.emit_event(name, event, msgspec.json.encode(data))
-        return count
 
     def refuse_commands(self) -> None:
         """Refuse new client commands because the run is ending.
@@ -196,11 +212,28 @@ class Steering:
         self.halt.refuse_waiting()
 
     def answer_late(self) -> None:
-        """Answer the `switch` commands whose wait for joint modes has ended."""
+        """Answer the `switch` commands whose wait for joint modes has ended, and goals that were planned."""
         ended = self._manager.switching.ended
         for number, refusal in ended:
             self.inbox.answer_command(number, refusal or Completion(self._record.cycle))
         ended.clear()
+        for number, goal in tuple(self.planned.items()):
+            if not isinstance(answer := self._goal_answer(goal), Acceptance):
+                del self.planned[number]
+                self.inbox.answer_command(number, answer)
+
+    def _goal_answer(self, goal: RunningGoal) -> Answer:
+        """Return the answer to the command of a goal: `Acceptance` while its controller plans it.
+
+        A pause stops the planning, so it is not awaited.
+        """
+        if goal.outcome is Outcome.ABORTED and not goal.has_begun:
+            fields = {"controller": goal.controller, "kind": goal.kind, "problem": goal.text}
+            return Refusal(Code.GOAL_REFUSED, {**fields, "goal": goal.number})
+        waited_ns = self._schedule.time_ns - goal.accepted_ns
+        if goal.has_begun or goal.outcome is not None or self.paused or waited_ns > LONGEST_PLANNING_NS:
+            return Completion(self._record.cycle, goals=(goal.number,))
+        return Acceptance((goal.controller,))
 
     # Rate and pause
 

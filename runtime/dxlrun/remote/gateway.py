@@ -158,6 +158,7 @@ _STATUS = {
     Code.NAMED_TWICE: 422,
     Code.WRONG_MOTION: 422,
     Code.NOT_LIVE: 422,
+    Code.GOAL_REFUSED: 422,
     Code.GOAL_STREAMED: 422,
     Code.TOO_SLOW: 422,
     Code.TOO_OFTEN: 429,

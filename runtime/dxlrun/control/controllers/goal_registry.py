@@ -170,6 +170,8 @@ class RunningGoal:
         self.origin = origin
         self.cancelling = False
         """True after a client asked to cancel the goal."""
+        self.has_begun = False
+        """True once the goal was neither aborted by `on_goal` nor while its controller planned it."""
         self.outcome: Outcome | None = None
         """Outcome of the goal; None while it is running."""
         self.progress, self.error, self.joint, self.text = 0.0, math.nan, "", ""
@@ -193,6 +195,7 @@ class RunningGoal:
         """
         if self.outcome is not None or self.is_judged:
             return
+        self.has_begun = True
         self.progress, self.error = float(progress), float(error)
         now_ns = self._goals.now_ns
         if now_ns - self._reported_ns >= FEEDBACK_NS:
@@ -209,6 +212,7 @@ class RunningGoal:
     ) -> None:
         """End the motion: from now on, the joints' states decide the outcome; see `controller.Goal.judge`."""
         if self.outcome is None and not self.is_judged:
+            self.has_begun = True
             self._goals.begin_judging(self, positions, joints, tolerances, text)
 
     def end(

@@ -199,7 +199,9 @@ class Manager:
         """True while the motion of any goal has ended but its outcome is still open."""
         return self._goals.are_settling
 
-    def dispatch_command(self, command: CommandMessage, pursued: RunningGoal | None = None) -> int | Refusal:
+    def dispatch_command(
+        self, command: CommandMessage, pursued: RunningGoal | None = None
+    ) -> RunningGoal | Refusal | None:
         """Pass a client's or the plan's command to its controller, which must be active.
 
         A command with a lease starts or continues a stream, which ends unless another command follows in time
@@ -211,7 +213,7 @@ class Manager:
                 runtime pursues or judges is preempted.
 
         Returns:
-            The number of the new goal if the command is a goal, else 0; or the refusal.
+            The new goal if the command is a goal; or the refusal.
         """
         self._goals.time_ns = self._schedule.time_ns
         if len(command.data) % 8:
@@ -239,7 +241,7 @@ class Manager:
             self.streams[managed.place] = managed
         if not streaming:
             self._events.emit_event(managed.plan.name, texts.command_accepted(kind, command.origin))
-        return 0
+        return None
 
     def _end_controller(self, managed: ManagedController, fault: ControllerFault) -> Refusal:
         self.switching.end_controller(managed, fault)
@@ -391,9 +393,12 @@ class Manager:
 
     def _begin_goal(
         self, managed: ManagedController, kind: str, data: NDArray[np.float64], origin: str
-    ) -> int | Refusal:
+    ) -> RunningGoal | Refusal:
         goal = self._accept(managed, kind, origin)
-        return self._attempt(managed, managed.begin_goal, goal, data) or goal.number
+        refusal = self._attempt(managed, managed.begin_goal, goal, data)
+        if goal.outcome is None and kind not in managed.controller.plans:
+            goal.has_begun = True
+        return refusal or goal
 
     def _begin_own_goal(self, controller: str, kind: str) -> RunningGoal:
         """Accept a goal that a controller begins itself. Raises ControllerFault for a kind without goals."""
@@ -456,12 +461,12 @@ class Manager:
                 for number in begun:
                     self.cancel_goal(number, "")
                 return found
-            begun.append(found)
+            begun.append(found.number)
         return tuple(begun)
 
     def _begin_part(
         self, part: PlayedPart, commands: tuple[NDArray[np.float64], ...], origin: str
-    ) -> int | Refusal:
+    ) -> RunningGoal | Refusal:
         managed = self._commandable(part.controller)
         if isinstance(managed, Refusal):  # deactivated because of a fault in an earlier part
             return managed
@@ -470,7 +475,7 @@ class Manager:
         goal = self._accept(managed, part.kind, origin)
         managed.adopt_goal(goal)
         self._motions[part.controller] = PlayedMotion(goal, part, commands, self._schedule.time_ns)
-        return goal.number
+        return goal
 
     def _play_on(self) -> None:
         """Dispatch the due commands of each motion being played, and remove motions that have ended."""
