@@ -119,7 +119,9 @@ def test_the_log_of_a_run_that_is_killed_beside_busy_programs_lacks_its_end_only
     before_ns = run.ledger()[-1].t_ns
     with busy_programs(3):  # beside them a start takes too long
         until(lambda: run.ledger()[-1].t_ns > before_ns + 2_000_000_000, "2 s on the wire", pause_s=0.2)
-        for process in run.processes().values():
+        processes = run.processes()
+        # The recorder first: it completes the log of a loop that has exited.
+        for process in (processes["log.recorder"], *processes.values()):
             with suppress(ProcessLookupError):
                 os.kill(process, signal.SIGKILL)
     run.finish()
