@@ -4,6 +4,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from tests.kit import selection, skips
@@ -53,6 +54,33 @@ def test_long_tests_are_first(tmp_path: Path) -> None:
     files = {"test_a.py": SHORT, "test_b.py": LONG, "test_c.py": SHORT + limited.replace("short", "limited")}
     said = run(tmp_path, "-n", "0", "--all", "--collect-only", files=files).out.splitlines()
     assert [line.partition("::")[0] for line in said[:4]] == ["test_b.py", *["test_c.py"] * 2, "test_a.py"]
+
+
+def test_each_worker_begins_with_slow_files_and_ends_with_short_tests() -> None:
+    """Of 12 tests: `a/2` is the second of folder a, L one of a slow file."""
+    names = ["a/L1", "a/2", "b/L1", "b/L2", "b/3", "b/4", "c/L1", "c/2", "c/3", "c/4", "c/5", "c/6"]
+    items = [
+        SimpleNamespace(
+            path=Path(name), get_closest_marker=lambda mark, name=name: mark == "long" and "L" in name
+        )
+        for name in names
+    ]
+    dealt = [[item.path.name for item in selection.deal(items, workers)] for workers in (1, 3)]
+    assert " ".join(dealt[0]) == "L1 L1 L2 L1 2 3 4 2 3 4 5 6"
+    assert " ".join(dealt[1]) == "L1 2 3 4 L1 L2 2 3 L1 4 5 6"
+
+
+def test_what_passed_is_left_out_of_the_next_run(tmp_path: Path) -> None:
+    torn = "def teardown_module():\n    assert False\ndef test_torn():\n    pass\n"
+    files = FILES | {"test_torn.py": torn, "test_wrong.py": "def test_wrong():\n    assert False\n"}
+    for words, left_out in (
+        ((), "long tests that no given change needs (--all"),
+        (("--all",), "tests that have"),
+    ):
+        ran = run(tmp_path, "-n", "2", "--passed=passed.txt", *words, files=files)
+        assert ran.last.startswith(f"left out: 1 {left_out}"), ran.out
+    passed = (tmp_path / "passed.txt").read_text().split()
+    assert passed == ["test_long.py::test_long", "test_short.py::test_short"]
 
 
 @pytest.mark.parametrize(

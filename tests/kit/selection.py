@@ -7,13 +7,15 @@ tests that a change can break:
     git diff --name-only main > changed.txt
     pytest --changed=changed.txt    # and the long tests of rooms that changed, or import what changed
     pytest --all                    # everything
+    pytest --all --passed=FILE      # and not the tests in FILE; those that pass are added to it
 
 How a run ends, and what the network is refused, is never marked as long: tests of safety always run.
 """
 
 import re
 from collections import Counter
-from collections.abc import Collection, Generator, Iterable, Iterator
+from collections.abc import Collection, Generator, Iterable, Iterator, Sequence
+from itertools import islice
 from pathlib import Path
 
 import pytest
@@ -129,6 +131,29 @@ def long_files() -> Iterator[tuple[str, str]]:
                 yield str(path.relative_to(ROOT)), text
 
 
+def deal(items: Sequence[pytest.Item], workers: int) -> list[pytest.Item]:
+    """Return the tests in an order in which every worker begins with slow files and ends with short tests.
+
+    `--dist worksteal` cuts the tests into one stretch a worker, and moves the end of a stretch to an idle
+    worker. Where that has slow files, the others wait for the last one. Files of a folder share fixtures, so
+    they stay together.
+    """
+    slow = {item.path for item in items if any(map(item.get_closest_marker, ("long", "timeout")))}
+    folders: dict[Path, list[pytest.Item]] = {}
+    for item in items:
+        if item.path in slow:
+            folders.setdefault(item.path.parent, []).append(item)
+    stretches: list[list[pytest.Item]] = [[] for _ in range(workers)]
+    for tests in folders.values():
+        min(stretches, key=len).extend(tests)
+    short = (item for item in items if item.path not in slow)
+    left = len(items)
+    for number, stretch in enumerate(stretches):
+        stretch.extend(islice(short, max(0, left // (workers - number) - len(stretch))))
+        left -= len(stretch)
+    return [*(item for stretch in stretches for item in stretch), *short]
+
+
 def add_options(parser: pytest.Parser) -> None:
     group = parser.getgroup("selection")
     group.addoption(
@@ -137,6 +162,7 @@ def add_options(parser: pytest.Parser) -> None:
     group.addoption(
         "--changed", metavar="FILE", help="file with the paths that changed: run their long tests"
     )
+    group.addoption("--passed", metavar="FILE", help="leave out tests that FILE has, and add those that pass")
 
 
 class Selection:
@@ -151,6 +177,12 @@ class Selection:
         if given is None and (changed := config.getoption("--changed")):
             given = [*affected_files(Path(changed).read_text("utf-8").split())]
         self._affected = set(given or ())
+        file = config.getoption("--passed")
+        self._record = Path(file) if file else None
+        self._passed: set[str] = set()
+        if self._record and self._record.exists():
+            self._passed.update(self._record.read_text("utf-8").splitlines())
+        self._passing: set[str] = set()
 
     @pytest.hookimpl(optionalhook=True)
     def pytest_configure_node(self, node: WorkerController) -> None:
@@ -159,27 +191,30 @@ class Selection:
 
     @pytest.hookimpl(tryfirst=True)
     def pytest_collection_modifyitems(self, config: pytest.Config, items: list[pytest.Item]) -> None:
-        """Leave out the long tests that no change can break, and put first the files of long ones.
-
-        Short ones at the end keep all cores busy.
-        """
-        left_out = {
-            item
-            for item in items
-            if item.get_closest_marker("long")
-            and not self._everything
-            and str(item.path.relative_to(config.rootpath)) not in self._affected
-        }
+        """Leave out what has passed and the long tests that no change can break, and deal out the others."""
+        left_out = {item for item in items if item.nodeid in self._passed or self._is_needless(item)}
         config.hook.pytest_deselected(items=[*left_out])
-        items[:] = [item for item in items if item not in left_out]
-        slow = {item.path for item in items if any(map(item.get_closest_marker, ("long", "timeout")))}
-        items.sort(key=lambda item: item.path not in slow)
+        workers = getattr(config, "workerinput", {}).get("workercount", 1)
+        items[:] = deal([item for item in items if item not in left_out], workers)
+
+    def _is_needless(self, item: pytest.Item) -> bool:
+        affected = str(item.path.relative_to(item.config.rootpath)) in self._affected
+        return bool(item.get_closest_marker("long")) and not self._everything and not affected
 
     def pytest_deselected(self, items: list[pytest.Item]) -> None:
         """Count what is left out."""
         for item in items:
+            passed = item.nodeid in self._passed
             long = item.get_closest_marker("long") and not self._everything
-            self._left_out["long" if long else "campaign" if item.get_closest_marker("campaign") else ""] += 1
+            campaign = item.get_closest_marker("campaign")
+            self._left_out["passed" if passed else "long" if long else "campaign" if campaign else ""] += 1
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        """Note a test that passes, until its teardown fails."""
+        if report.failed:
+            self._passing.discard(report.nodeid)
+        elif report.when == "call" and report.passed:
+            self._passing.add(report.nodeid)
 
     @pytest.hookimpl(optionalhook=True)
     def pytest_testnodedown(self, node: WorkerController) -> None:
@@ -194,7 +229,12 @@ class Selection:
         yield
         if output is not None:
             return
+        if self._record:
+            self._record.write_text(
+                "".join(f"{one}\n" for one in sorted(self._passed | self._passing)), "utf-8"
+            )
         reasons = {
+            "passed": "tests that have passed (--passed)",
             "long": "long tests that no given change needs (--all runs them)",
             "campaign": "campaigns that run at night or for a release (--campaigns lists them)",
         }
