@@ -45,6 +45,15 @@ def test_a_quoted_word_can_have_several_pairs() -> None:
     assert written.data == {"x": 0.2, "y": "-3 cm", "rpy": "0, 90 deg, 0", "frame": "base"}
 
 
+def test_the_first_word_may_begin_with_a_name() -> None:
+    written = WrittenEntry.from_words(["above seconds=2"], None, named=True)
+    assert written.with_key("pose") == {"pose": "above", "seconds": 2}
+    with pytest.raises(InputError, match="'above' and seconds=2 exclude each other; remove one of them"):
+        written.with_key("seconds")
+    with pytest.raises(InputError, match="'above' is not key=value"):
+        WrittenEntry.from_words(["above seconds=2"], None)
+
+
 def test_list_shows_the_state_of_a_robot() -> None:
     info = {"name": "arm", "rate": 320.0, "paused": True, "cycles": 7, "skipped": 1, "log": "logs/arm.mcap"}
     assert headline(info) == "arm: 320 Hz, paused, 7 cycles, 1 period skipped, log logs/arm.mcap"

@@ -17,6 +17,7 @@ from dxlrun.errors import DxlrunError, InputError, Refused
 from dxlrun.output.terminal import print_error, print_warning, progress_bar, show_json, show_parts
 
 if TYPE_CHECKING:
+    from dxlrun.cli.steering.written import WrittenEntry
     from dxlrun.remote.client import Executed, RemoteRobot
     from dxlrun.remote.requests.replies import GoalState
 
@@ -73,15 +74,12 @@ def send(
         seconds = None if in_ is None else duration(in_, bare="s") * 1e-9
     except ValueError as error:
         raise InputError(f"--in: {error}") from None
-    named = bool(words) and "=" not in words[0]
-    written = WrittenEntry.from_words(words[named:], file)  # before a robot is needed
+    written = WrittenEntry.from_words(words, file, named=True)  # before a robot is needed
     with connect_robot(chosen.robot, "send") as robot:
-        if named:
-            words = (f"{_name_key(robot, controller, kind)}{words[0]}", *words[1:])
-            written = WrittenEntry.from_words(words, file)
+        data = _with_key(robot, controller, kind, written) if written.name else written.data
         try:
             with begun_or_cancelled(robot, "send", waited=wait):
-                done = robot.send(controller, kind, written.data, units=True, seconds=seconds, goal=wait)
+                done = robot.send(controller, kind, data, units=True, seconds=seconds, goal=wait)
         except Refused as refused:
             known = refused.fields.get("known")
             mistaken = refused.code == Code.UNKNOWN_COMMAND and refused.fields.get("kind") == kind
@@ -108,18 +106,20 @@ def _answer_hint(robot: RemoteRobot, controller: str, kind: str) -> str:
     return f"; see the answer by `dxlrun echo {topic} --count 1`" if has_answers else ""
 
 
-def _name_key(robot: RemoteRobot, controller: str, kind: str) -> str:
-    """Return `key=` with the first key of a command; empty if that key does not accept a name."""
+def _with_key(robot: RemoteRobot, controller: str, kind: str, written: WrittenEntry) -> dict[str, object]:
+    """Return the keys of a command that begins with a name, which is the value of the first key.
+
+    Raises InputError if that key does not accept a name.
+    """
     listed = robot.info().get("controllers")
-    found = [one["takes"] for one in listed if one["name"] == controller] if isinstance(listed, list) else []
-    if not found:
-        return "name="  # The gateway refuses an unknown controller, whatever the keys are
-    fields = found[0].get(kind, {}).get("properties", {})
-    if not fields:
-        return ""
-    key, field = next(iter(fields.items()))
-    is_name = any(each.get("type") == "string" for each in field.get("anyOf", [field]))
-    return f"{key}=" if is_name else ""
+    takes = [one["takes"] for one in listed if one["name"] == controller] if isinstance(listed, list) else []
+    if not takes or kind not in takes[0]:
+        return {}  # The robot names the unknown controller or command, or the missing joint
+    for key, field in takes[0][kind].get("properties", {}).items():
+        if any(each.get("type") == "string" for each in field.get("anyOf", [field])):
+            return written.with_key(key)
+        break
+    return written.with_key("")
 
 
 def cancel(goal: str = "", /, *, wait: WaitFlag = False, chosen: RobotChoice = ONLY_ONE) -> int:

@@ -29,15 +29,19 @@ class WrittenEntry:
 
     grown: PlainDocument
     in_words: bool
+    name: str = ""
+    """First word, if it is a name without its key."""
 
     @classmethod
-    def from_words(cls, words: Sequence[str], file: Path | None) -> WrittenEntry:
+    def from_words(cls, words: Sequence[str], file: Path | None, *, named: bool = False) -> WrittenEntry:
         """Read `key=value` words, each with one pair or several, or a file.
 
-        Raises InputError if both are given, and for invalid YAML.
+        With `named`, the first word may begin with a name without its key. Raises InputError if words and
+        file are given, and for invalid YAML.
         """
         if file is not None and words:
             raise InputError(f"{words[0]!r} and --file exclude each other; give the words, or the file")
+        first = ""
         if file is not None:
             text, name = read_text(file), str(file)
         else:
@@ -45,9 +49,11 @@ class WrittenEntry:
                 if word[-1:].isdigit() and "=" in word and _UNIT.fullmatch(unit):
                     raise InputError(f"{unit!r} is not key=value; write {word}{unit} without the space")
             pairs = [pair for word in words for pair in _NEXT_KEY.split(word)]
+            if named and pairs and "=" not in pairs[0]:
+                first = pairs.pop(0)
             text, name = "\n".join(map(_line, pairs)) or "{}", _WORDS
         try:
-            written = cls(grow(parse(text, name), name, literal), in_words=file is None)
+            written = cls(grow(parse(text, name), name, literal), in_words=file is None, name=first)
         except InputError as error:
             raise _input_error(error.problems, file is None) from None
         if written.grown.problems:
@@ -56,8 +62,22 @@ class WrittenEntry:
 
     @property
     def data(self) -> dict[str, object]:
-        """Values by key; quantities are still texts with units."""
+        """Values by key, without `name`; quantities are still texts with units."""
         return self.grown.data
+
+    def with_key(self, key: str) -> dict[str, object]:
+        """Return the values by key, with `name` under its key; raise InputError if it has none or has two.
+
+        Args:
+            key: Key that accepts a name; empty: the command has none.
+        """
+        if not key:
+            _line(self.name)
+        if key in self.data:
+            raise InputError(
+                f"{self.name!r} and {key}={self.data[key]} exclude each other; remove one of them"
+            )
+        return {key: self.name} | self.data
 
     def located(self, refused: Refused) -> DxlrunError:
         """Return a refusal with one line for each wrong quantity, or as InputError with places in the YAML
