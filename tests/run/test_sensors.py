@@ -208,15 +208,27 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str) -> Pla
     return plan_with(tmp_path, "sensors:\n  sonar: {type: stubborn}\n")
 
 
-def test_a_driver_that_does_not_close_ends_also_without_a_supervisor(tmp_path, monkeypatch):
-    plan = installed(tmp_path, monkeypatch, STUBBORN)
-    child = start_only(plan, create_memory(plan))
+CLOSES = STUBBORN.replace("while True", "import os; os.mkdir('closed')\n        while False")
+
+
+@pytest.mark.parametrize(
+    ("text", "code", "state"),
+    [(CLOSES, 0, SlotState.ENDED), (STUBBORN, -signal.SIGALRM, SlotState.OPEN)],
+    ids=["closes", "does not close"],
+)
+def test_a_driver_is_closed_and_ends_also_without_a_supervisor(tmp_path, monkeypatch, text, code, state):
+    monkeypatch.chdir(tmp_path)
+    plan = installed(tmp_path, monkeypatch, text)
+    memory = create_memory(plan)
+    child = start_only(plan, memory)
     try:
         child.ready()
         child.process.terminate()  # as the kernel does when the supervisor is gone
-        assert child.process.wait(DEADLINE_S) == -signal.SIGALRM
+        assert child.process.wait(DEADLINE_S) == code
     finally:
         child.kill()
+    assert SlotReader(mapped(memory.slots["sensors"][0])).state is state
+    assert (tmp_path / "closed").exists() == (text is CLOSES)
 
 
 SPOILS = """
