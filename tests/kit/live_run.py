@@ -9,7 +9,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -71,6 +71,15 @@ def dxlrun_contract():
 def dxlrun_controllers():
     return {{'odd': Odd}}
 """
+
+
+def torque_changes(ledger: Sequence[LedgerEntry]) -> Iterator[tuple[int, int, bool]]:
+    """Follow what the bytes on the wire of `pair` did to torque: yield time, servo, and whether it is on."""
+    for t_ns, servo, address, data in all_writes(ledger, PAIR):
+        if address <= TORQUE_ENABLE < address + len(data):
+            yield t_ns, servo, bool(data[TORQUE_ENABLE - address])
+        elif address <= GOAL_POSITION < address + len(data):
+            yield t_ns, servo, True
 
 
 @dataclass
@@ -137,12 +146,7 @@ class Running:
         return b"".join(entry.data for entry in self.ledger() if entry.direction == "in")
 
     def torque_changes(self) -> Iterator[tuple[int, bool]]:
-        """Follow what the bytes on the wire of `pair` did to torque."""
-        for _, servo, address, data in all_writes(self.ledger(), PAIR):
-            if address <= TORQUE_ENABLE < address + len(data):
-                yield servo, bool(data[TORQUE_ENABLE - address])
-            elif address <= GOAL_POSITION < address + len(data):
-                yield servo, True
+        yield from ((servo, on) for _, servo, on in torque_changes(self.ledger()))
 
     def is_limp(self) -> bool:
         """Judge by the ledger alone that no servo of `pair` was left with torque."""

@@ -1,31 +1,31 @@
-"""Campaign: two hits, KILL or STOP, on two processes of a run; servos emulated by `tests/kit/emulator.py`.
+"""Campaign: two hits, KILL or STOP, on two processes of a run; its servos are simulated by another process.
 
 One survivor of main process, guardian and loop takes torque off. Recorder and gateway do not end control.
 Afterwards nothing of the run is left but processes that are stopped, or that wait for one that is, and
 `dxlrun stop` ends these. Torque must be off in time after the last hit on these three, not counting the time
-for which the kernel let emulator, survivors or this process wait for a processor. Each pair prints both.
+for which the kernel let servos, survivors or this process wait for a processor. Each pair prints both.
 """
 
-import json
+import math
 import os
 import signal
 import subprocess
-import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import pytest
 from tests.kit.awaited import DEADLINE_S, until
+from tests.kit.bus_process import BusProcess
 from tests.kit.campaigns import campaign
-from tests.kit.live_run import DXLRUN, ROBOT, Running, Start, together
+from tests.kit.live_run import DXLRUN, ROBOT, Running, Start, together, torque_changes
 
 from dxlrun.remote.sockets import sockets
+from dxlsim.bus.ledger import read_ledger
+from dxlsim.simulation_plan import BusConfig, ServoConfig
 
-EMULATOR = Path(__file__).parents[1] / "kit/emulator.py"
-IDS = ("3", "7")
+IDS = (3, 7)
 MODULES = {
     "main": "dxlrun",
     "guardian": "run.guardian",
@@ -74,31 +74,28 @@ PAIRS = tuple(
 """All 90 pairs, the telling ones first."""
 
 
-class Servos(NamedTuple):
-    """The emulated servos: their terminal, their journal, and their process."""
+class Servos(BusProcess):
+    """The simulated servos, whose ledger is the judge."""
 
-    port: str
-    journal: Path
-    pid: int
+    def __init__(self, folder: Path) -> None:
+        servos = tuple(ServoConfig(each, "AX-12A", math.radians(150)) for each in IDS)
+        self.seen = folder / "servos.jsonl"
+        super().__init__((BusConfig("main", 1_000_000, servos),), self.seen)
 
-    def entries(self, what: str) -> list[dict[str, Any]]:
-        """Return the journal's lines of a kind, the oldest first."""
-        lines = self.journal.read_bytes().splitlines()
-        return [entry for entry in map(json.loads, lines) if entry["what"] == what]
+    def instructions(self) -> int:
+        """Return how many came."""
+        return sum(entry.direction == "in" for entry in read_ledger(self.seen))
 
-    def torque(self) -> dict[int, int]:
-        """Return Torque Enable of each servo that had it written."""
-        return {entry["servo"]: entry["value"] for entry in self.entries("torque")}
+    def torque(self) -> dict[int, tuple[bool, int]]:
+        """Return of each servo that had its torque written whether it is on, and since when, ns."""
+        found: dict[int, tuple[bool, int]] = {}
+        for t_ns, servo, on in torque_changes(read_ledger(self.seen)):
+            if found.get(servo, (False, 0))[0] != on:
+                found[servo] = on, t_ns
+        return found
 
-    def limp_since_ns(self) -> int:
-        """Return when the last servo lost torque."""
-        torque: dict[int, int] = {}
-        since_ns = 0
-        for entry in self.entries("torque"):
-            if torque.get(entry["servo"]) == 1 and not entry["value"]:
-                since_ns = entry["t_ns"]
-            torque[entry["servo"]] = entry["value"]
-        return since_ns
+    def are_limp(self) -> bool:
+        return not any(on for on, _ in self.torque().values())
 
 
 class Starvation:
@@ -126,18 +123,6 @@ def waited_ns(pid: int) -> int:
     return 0
 
 
-@contextmanager
-def emulated(folder: Path) -> Iterator[Servos]:
-    journal = folder / "journal.jsonl"
-    command = [sys.executable, str(EMULATOR), str(journal), *IDS]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        try:
-            assert process.stdout
-            yield Servos(process.stdout.readline().strip(), journal, process.pid)
-        finally:
-            process.kill()
-
-
 def controlled(start: Start, folder: Path, servos: Servos, *, gateway: bool) -> Running:
     """Return a run of `pair` under its own name that controls the servos; a gateway only to be hit."""
     name = f"pair_{os.getpid()}_{folder.name}"
@@ -145,21 +130,21 @@ def controlled(start: Start, folder: Path, servos: Servos, *, gateway: bool) -> 
     robot.write_text(
         ROBOT.replace("latency: 1 ms", "latency: 4 ms").replace("name: pair", f"name: {name}", 1)
     )
-    run = start(f"port:={servos.port}", robot=robot, gateway=gateway, directory=folder)
+    run = start(f"port:={servos.ports['main']}", robot=robot, gateway=gateway, directory=folder)
     wanted = {module for name, module in MODULES.items() if gateway or name != "gateway"}
     until(lambda: wanted <= set(run.processes()), "all processes", check=run.lives)
     if gateway:  # before it listens, its end ends a run on a real port: the robot was held for it
         until(lambda: name in sockets(), "the socket", check=run.lives)
-    until(lambda: sum(servos.torque().values()) == len(IDS), "torque", check=run.lives)
+    until(lambda: sum(on for on, _ in servos.torque().values()) == len(IDS), "torque", check=run.lives)
     in_control(servos)
     return run
 
 
 def in_control(servos: Servos) -> None:
     """Wait for twenty more exchanges, torque on."""
-    before = len(servos.entries("instruction"))
-    until(lambda: len(servos.entries("instruction")) > before + 20, "more exchanges")
-    assert set(servos.torque().values()) == {1}
+    before = servos.instructions()
+    until(lambda: servos.instructions() > before + 20, "more exchanges")
+    assert [on for on, _ in servos.torque().values()] == [True] * len(IDS)
 
 
 def end_what_is_left(run: Running) -> str:
@@ -189,10 +174,10 @@ def end_what_is_left(run: Running) -> str:
 def check_pair(start: Start, folder: Path, pair: tuple[Hit, Hit], pause_s: float, longest_ms: float) -> None:
     """Let two hits happen to a run, and judge when torque was off."""
     folder.mkdir()
-    with emulated(folder) as servos:
+    with Servos(folder) as servos:
         run = controlled(start, folder, servos, gateway="gateway" in {hit.process for hit in pair})
         pids = run.processes()
-        starvation = Starvation(os.getpid(), servos.pid, *(pids[MODULES[one]] for one in IN_CONTROL))
+        starvation = Starvation(os.getpid(), servos.child.pid, *(pids[MODULES[one]] for one in IN_CONTROL))
         hit_ns = 0
         for hit in pair:
             if hit.process in IN_CONTROL:
@@ -206,11 +191,11 @@ def check_pair(start: Start, folder: Path, pair: tuple[Hit, Hit], pause_s: float
 
         def limp() -> bool:
             starvation.look()
-            return not any(servos.torque().values())
+            return servos.are_limp()
 
         until(limp, "torque off")
         if hit_ns:
-            after_ms = (servos.limp_since_ns() - hit_ns) / 1e6
+            after_ms = (max(since_ns for _, since_ns in servos.torque().values()) - hit_ns) / 1e6
             starved_ms = starvation.total_ms
             print(
                 f"TORQUE OFF after {after_ms:.0f} ms, {starved_ms:.0f} ms without a processor: "
@@ -218,7 +203,7 @@ def check_pair(start: Start, folder: Path, pair: tuple[Hit, Hit], pause_s: float
             )
             assert after_ms - starved_ms < longest_ms
         err = end_what_is_left(run)
-        assert not any(servos.torque().values())
+        assert servos.are_limp()
     if pair == (Hit("main", "STOP"), Hit("gateway", "STOP")):  # as `fg` shows it
         assert "was suspended (such as by Ctrl-Z)" in " ".join(err.split())
 
