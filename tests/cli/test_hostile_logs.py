@@ -1,6 +1,5 @@
 """Logs are what people send each other: no verb executes what is in one, or leaves its own folder for it."""
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -110,15 +109,3 @@ def test_no_verb_executes_a_log_or_leaves_its_folder(
         assert not (work / "executed").exists(), (line, said)
     assert all(path.is_relative_to(work) for path in set(tmp_path.rglob("*")) - before)
     assert sorted(path.name for path in outside.iterdir()) == ["foreign.yaml"]
-
-
-def test_same_log_is_executed_when_it_is_trusted(
-    honest: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    write_changed(honest / "run.mcap", Path("bad.mcap"), plan(edit("other code", tmp_path)))
-    assert main(["replay", "bad.mcap", "--json"]) == 2
-    assert "--code log" in json.dumps(json.loads(capfd.readouterr().out))
-    assert not Path("executed").exists()
-    assert main(["replay", "bad.mcap", "--code", "log"]) == 0
-    assert Path("executed").exists()

@@ -31,7 +31,6 @@ from dxlrun.channels.event_records import (
     GoalTotals,
     Severity,
 )
-from dxlrun.errors import PortError
 from dxlrun.log.log_reader import read_log
 from dxlrun.plan.machine_load import MachineLoad, SimulationWait
 from dxlrun.run.run_summary import RunOptions, RunStatusLine, RunSummary, run_verdict
@@ -207,12 +206,6 @@ def test_real_servos_of_a_busy_machine_are_not_to_be_simulated(
 ) -> None:
     runs.return_value = replace(GOOD, run_load=BUSY)
     assert dxlrun(torso, "port:=/dev/ttyUSB0").out.splitlines()[1].endswith(" s. End other programs.")
-
-
-def test_port_that_cannot_be_opened_is_one_sentence(dxlrun: Dxlrun, runs: Mock, torso: Path) -> None:
-    runs.side_effect = PortError("port /dev/ttyUSB7 does not exist; plug the adapter in")
-    said = dxlrun(torso, "port:=/dev/ttyUSB7")
-    assert (said.code, said.errors[1:]) == (1, [f"dxlrun: {runs.side_effect}"])
 
 
 def test_played_motion_that_missed_its_goal_fails_the_run(

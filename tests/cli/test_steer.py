@@ -7,7 +7,6 @@ import re
 import runpy
 import shlex
 import shutil
-import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -34,7 +33,6 @@ PAGE = page_text("steering.md")
 TORSO = ROOT / "robots" / "bioloid_torso.yaml"
 NAME = "bioloid_torso"
 ACTIVE = {"joint_state_broadcaster", "head", "left_arm", "right_arm"}
-CODE = "import sys; from dxlrun.cli import main; sys.exit(main())"
 
 
 class Torso(VirtualLink):
@@ -242,24 +240,6 @@ def run(runs: LiveRuns) -> Iterator[Running]:
             active = {one["name"] for one in robot.info()["controllers"] if one["active"]}
             if active != ACTIVE:
                 robot.switch(sorted(ACTIVE - active), sorted(active - ACTIVE))
-
-
-def test_ctrl_c_at_a_terminal_that_waits_cancels_the_goal(run: Running) -> None:
-    words = ("send", "left_arm", "position", "left_elbow_joint=-20deg", "--in", "60s", "--wait")
-    with connect() as robot:
-        before = len(robot.goals())
-        waiting = subprocess.Popen(
-            [sys.executable, "-P", "-c", CODE, *words], stderr=subprocess.PIPE, stdout=subprocess.PIPE
-        )
-        until(lambda: len(robot.goals()) > before, check=run.lives)
-        goal = robot.goals()[-1]
-        assert (goal.status, goal.controller) == ("running", "left_arm")
-        waiting.send_signal(signal.SIGINT)
-        out, err = (text.decode() for text in waiting.communicate(timeout=DEADLINE_S))
-        assert (waiting.returncode, out) == (130, ""), err
-        assert f"goal {goal.number} of left_arm cancelled" in err
-        assert err.endswith("interrupted\n")
-        assert robot.goal_state(goal.number).status == "cancelled"
 
 
 def test_the_script_of_the_page_steers_a_torso(run: Running, tmp_path: Path) -> None:

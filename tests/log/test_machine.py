@@ -11,7 +11,6 @@ from dxlrun.log import schemas
 from dxlrun.log.machine import MachineSampler, load_sample
 from dxlrun.messages.cdr import Codec
 from dxlrun.plan.machine_load import LoadMeter, LoadSample, MachineLoad
-from dxlrun.testing import read_log, simulated_robot
 
 PID = 4711
 BEFORE = {
@@ -96,13 +95,6 @@ def test_a_core_that_goes_offline_and_comes_back_is_not_a_number_between(tmp_pat
     values = sampled(tmp_path, BEFORE, one)
     assert np.isnan(values["user"]).all()
     assert len(values["user"]) == 2
-
-
-def test_virtual_runs_have_no_machine_and_stay_equal(tmp_path):
-    for name in ("a", "b"):
-        simulated_robot("robots/single_joint.yaml", duration_s=0.2, log=tmp_path / f"{name}.mcap").run()
-    assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
-    assert schemas.LogTopic.MACHINE not in read_log(tmp_path / "a.mcap").topics
 
 
 SECOND = 10**9

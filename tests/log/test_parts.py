@@ -21,7 +21,6 @@ from dxlrun.log.log_reader import Log, LogFollower, open_log, read_log
 from dxlrun.log.part_writer import PartWriter, open_writer
 from dxlrun.log.schemas import LogHeader
 from dxlrun.plan.recording_plan import PART_END_NAME, PART_NAME, RecordingPlan
-from dxlrun.testing import VirtualRobot, plan_of
 from dxlrun_analysis.cycles.punctuality import Punctuality
 from dxlwire.clock import VirtualClock
 from dxlwire.packets import PacketKind
@@ -195,16 +194,6 @@ def test_parts_of_a_robot_have_the_same_as_its_whole_log(torso):
         assert summary is not None
         assert summary.statistics is not None
         assert sum(1 for _ in decode_log(file)) == summary.statistics.message_count > 0
-
-
-def test_two_runs_on_virtual_time_keep_the_same_parts_to_the_bit(tmp_path):
-    plan = plan_of(ROBOTS / "single_joint.yaml", duration_s=1)
-    plan = replace(plan, recording=RecordingPlan(split_ns=SECOND // 4, keep_ns=SECOND // 8))
-    for name in ("once", "again"):
-        VirtualRobot(plan, log=tmp_path / name).run()
-    once, again = (sorted((tmp_path / name).iterdir()) for name in ("once", "again"))
-    assert [path.name for path in once] == [path.name for path in again] == names(3)
-    assert [path.read_bytes() for path in once] == [path.read_bytes() for path in again]
 
 
 # Parts that are missing, damaged, or none

@@ -1,7 +1,10 @@
 """A reboot in a whole run on virtual time, and its verdict; other requests: stories/requests.txt."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+from tests.kit.cases import read_head
 from tests.kit.sampled_run import SampledRun
 from tests.kit.stories import ask
 from tests.kit.totals import totals_of
@@ -10,19 +13,7 @@ from dxlrun.channels.cycle import Torque
 from dxlrun_analysis.joints.goal_tracking import tracking
 from dxlrun_analysis.verdict import judge_run
 
-ROBOT = """\
-name: arm
-buses:
-  main: {port: sim, protocol: 2.0, baud_rate: 1_000_000, return_delay_time: 0 us}
-loop: {rate: 100}
-joints:
-  shoulder: {bus: main, id: 1, model: XM430-W350, reference: 180 deg, direction: 1}
-  elbow: {bus: main, id: 2, model: XM430-W350, reference: 180 deg, direction: 1, torque: on}
-  wrist: {bus: main, id: 3, model: XM430-W350, reference: 180 deg, direction: -1}
-controllers:
-  arm: {type: joint_group_position_controller, joints: [shoulder, elbow]}
-  hand: {type: joint_group_position_controller, joints: [wrist]}
-"""
+ROBOT = read_head(Path(__file__).with_name("stories") / "requests.txt")
 
 
 @pytest.mark.parametrize("requested", [True, False])

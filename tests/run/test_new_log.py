@@ -63,14 +63,6 @@ def test_logs_and_ledgers_are_for_the_user_and_the_group(tmp_path, create):
     assert {oct(path.stat().st_mode & 0o777) for path in files} == {"0o640"}
 
 
-def test_a_log_with_something_in_it_is_never_written_over(tmp_path):
-    path = tmp_path / "old.mcap"
-    path.write_bytes(b"old")
-    with pytest.raises(FileExistsError):
-        LogFile(path)
-    assert path.read_bytes() == b"old"
-
-
 def test_a_directory_that_takes_no_file_is_an_input_error(tmp_path, monkeypatch):
     def refuse(path, mode, *, exist_ok):
         raise PermissionError(errno.EACCES, "Permission denied", str(path))

@@ -13,7 +13,6 @@ from pathlib import Path
 import pytest
 from tests.kit.awaited import until
 from tests.kit.live_run import ROBOT, Running, Start, together
-from tests.kit.totals import totals_of
 
 from dxlrun.channels.event_records import EventCode, Severity
 
@@ -81,23 +80,6 @@ def test_stopped_simulation_skips_periods_and_loses_no_joint_unless_it_stays_sto
 
     cases = (("protocol 1", ROBOT, 0.3), ("protocol 2", WITH_WATCHDOG, 0.3), ("for long", ROBOT, 1.2))
     together(check, {case[0]: case for case in cases})
-
-
-def test_a_loop_that_was_stopped_accuses_no_servo(start: Start, tmp_path: Path) -> None:
-    slow = tmp_path / "slow.yaml"
-    slow.write_text(ROBOT.replace("rate: 50", "rate: 20"))
-    run = start("--duration", "3600", robot=slow)
-    run.wait_until_moving()
-    stop_for(run, "run.loop_process", 0.12, 0.1)  # the guardian waits for 0.25 s
-    run.signal(signal.SIGINT)
-    run.finish()
-    path = run.log_path()
-    assert path is not None
-    found = totals_of(path).causes
-    most = max(found.causes, key=lambda one: one.total_ns)
-    assert most.total_ns > 50_000_000
-    assert most.kind in ("late wake-up", "machine", "own work", "late reply")
-    assert not any("servo" in one.subject for one in found.causes)
 
 
 @contextmanager

@@ -5,10 +5,9 @@ from pathlib import Path
 import pytest
 from tests.kit.awaited import DEADLINE_S, until
 from tests.kit.commands import Dxlrun, command_line
-from tests.kit.live_run import GOAL_POSITION, PAIR, ROBOT, LiveRuns, Running, Start
+from tests.kit.live_run import GOAL_POSITION, PAIR, ROBOT, Running, Start
 from tests.kit.wire import all_writes
 
-from dxlrun.process_table import found_runs
 from dxlrun.remote.sockets import sockets
 from dxlrun.run.unsteered import unsteered_runs
 
@@ -82,23 +81,3 @@ def test_stop_ends_the_run_that_listens_under_the_name_and_refuses_one_of_severa
     for one in bare:  # the last one is the only one of that name
         assert dxlrun("stop", "--robot", f"twin_arm-{one.process.pid}").out.startswith("twin_arm")
         assert one.process.wait(DEADLINE_S) == 0
-
-
-def test_a_run_that_starts_is_not_called_one_that_cannot_be_steered(
-    dxlrun: Dxlrun, live_runs: LiveRuns, tmp_path: Path
-) -> None:
-    go = tmp_path / "go"
-    running = live_runs.start_odd(configure=f"while not os.path.exists({str(go)!r}): time.sleep(0.01)")
-
-    def found() -> bool:
-        pid = running.process.pid
-        return any(one.pid == pid for run in found_runs() if run.process("loop") for one in run.processes)
-
-    until(found, "its loop", check=running.lives)
-    starting = "pair is starting; try again when it runs"
-    assert dxlrun("list").err == f"dxlrun: {starting}\n"
-    assert dxlrun("halt").err == f"dxlrun: {starting}\n"
-    go.touch()
-    running.wait_until_moving()
-    assert NO_GATEWAY in dxlrun("list").err
-    assert dxlrun("stop").code == 0

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from msgspec.structs import replace
-from tests.kit.judges import log_has_every_byte
 
 from dxlrun.channels.commands import CommandMessage
 from dxlrun.channels.event_records import EventCode
@@ -170,15 +169,6 @@ def test_two_runs_with_one_seed_are_the_same_to_the_bit_and_another_seed_is_anot
         assert first.read_bytes() == second.read_bytes()
     assert other[0].read_bytes() != once[0].read_bytes()
     assert any("fault: " in entry.note for entry in read_ledger(once[1]))
-
-
-@pytest.mark.parametrize("seed", [1, 3])
-def test_the_log_has_a_storm_as_the_bus_saw_it(plan, tmp_path, seed):
-    log, ledger = run(plan, tmp_path / "run", seed)
-
-    entries = read_ledger(ledger)
-    log_has_every_byte(read_log(log), entries)
-    assert any("fault: " in entry.note for entry in entries)
 
 
 MODEL_ROBOT = """\

@@ -130,20 +130,6 @@ def test_a_loop_that_got_no_processor_is_told_from_one_that_hangs(processor):
     assert processor(113, "D").starved_ns(80 * MS) is None
 
 
-def test_each_standstill_counts_from_its_own_begin(processor):
-    processor(100, "R").note_standstill(10 * MS)
-    processor(200, "R").note_standstill(0)
-    assert processor(200, "R").starved_ns(0) is None
-    processor(300, "R").note_standstill(10 * MS)
-    assert processor(301, "R").starved_ns(80 * MS) == MS
-
-
-def test_a_kernel_that_does_not_say_gives_no_reason(tmp_path):
-    none = ProcessorTime(tmp_path)
-    none.note_standstill(10 * MS)
-    assert none.starved_ns(80 * MS) is None
-
-
 @pytest.mark.parametrize(
     ("priority", "fix"), [(0, "; write loop.scheduler.policy: round_robin to run it"), (32, "")]
 )
@@ -445,29 +431,6 @@ def test_a_loop_that_stands_still_hangs_and_one_that_does_not_stop_is_late(watch
 # Who acts when others are silent
 
 
-OTHERS = {
-    which: tuple(
-        frozenset(
-            other
-            for at, other in enumerate(one for one in WatchedProcess if one is not which)
-            if bits >> at & 1
-        )
-        for bits in range(4)
-    )
-    for which in WatchedProcess
-}
-
-
-def test_exactly_one_process_acts_whichever_are_silent():
-    absences = {silent for sets in OTHERS.values() for silent in sets}
-    assert absences
-    for silent in absences:
-        acting = [
-            one for one in WatchedProcess if one not in silent and duty_of(one, silent) is not Duty.NONE
-        ]
-        assert len(acting) == bool(silent), silent
-
-
 @pytest.mark.parametrize(
     ("watcher", "silent", "duty"),
     [
@@ -590,12 +553,6 @@ def test_a_slow_loop_ends_when_neither_has_responded_for_a_period(page):
     with Stopped() as supervisor, Stopped() as guardian:
         loop_watch = LoopWatch(page, supervisor, guardian, 2000 * MS, 0)
         assert [loop_watch.duty(at_ms * MS) for at_ms in (2000, 4000)] == [Duty.NONE, Duty.END]
-
-
-def test_a_loop_on_a_starved_machine_goes_on(page):
-    """Both others only wait for a processor: this process stands for them."""
-    loop_watch = LoopWatch(page, os.getpid(), os.getpid(), 20 * MS, 0)
-    assert {loop_watch.duty(at_ms * MS) for at_ms in range(0, 4000, 20)} == {Duty.NONE}
 
 
 def test_a_loop_that_nobody_watches_asks_itself_to_stop_and_reports_why(page):

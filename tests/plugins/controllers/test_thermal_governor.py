@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from tests.kit.robots import robot_text
 
 from dxlrun.compile.robot_compiler import compile_files
 from dxlrun.control.controllers.plugin_loading import load_plugins
@@ -9,16 +10,6 @@ from dxlrun.errors import InputError
 from dxlrun.remote.preparation import Preparation, RefusedRequest
 from dxlrun_analysis.replay.changes import Setting, with_settings
 from dxlrun_controllers.thermal_governor import torque_scale
-
-ROBOT = """\
-name: hot
-buses: {main: {port: sim, protocol: 2.0, baud_rate: 1_000_000}}
-loop: {rate: 50}
-joints:
-  j: {bus: main, id: 1, model: XM430-W350, reference: 180 deg, direction: 1}
-controllers:
-  hot: {type: thermal_governor, joints: [j], reach: 12 deg}
-"""
 
 
 def test_torque_is_taken_in_proportion():
@@ -29,7 +20,7 @@ def test_torque_is_taken_in_proportion():
 
 def test_a_controller_that_is_loaded_or_replayed_is_compared_with_the_robot_too(tmp_path):
     path = tmp_path / "robot.yaml"
-    path.write_text(ROBOT)
+    path.write_text(robot_text("governor"))
     loop, plugins = compile_files(path, {}, []).plan.loop, load_plugins()
     preparation = Preparation({joint.name: joint for joint in loop.joints}, plugins, urdf=loop.urdf)
     entry = {"name": "more", "type": "thermal_governor", "joints": ["j"], "reach": "12 deg"}

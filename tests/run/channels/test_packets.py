@@ -48,22 +48,6 @@ def desk_of(room: int) -> memoryview:
     return memoryview(bytearray(DESK_SIZE - LONGEST_BATCH + room))
 
 
-@settings(max_examples=100, deadline=None)
-@given(st.lists(st.one_of(PACKETS, st.just(None)), max_size=30))
-def test_packets_come_out_as_they_went_in(steps):
-    slots, writer = collected()
-    batch = PacketBatch(writer, desk_of(128))
-    for step in [*steps, None]:
-        if step is None:
-            batch.commit_packets()
-        else:
-            batch.packet(
-                step.bus, step.kind, step.servo_id, step.first_ns, step.last_ns, bytearray(step.data)
-            )
-    assert [packet for slot in slots for packet in decode_packets(slot)] == [step for step in steps if step]
-    assert all(0 < len(slot) <= 128 for slot in slots)
-
-
 @settings(max_examples=30, deadline=None)
 @example(bytes(range(256)))
 @given(st.binary(min_size=1, max_size=400))
