@@ -11,6 +11,7 @@ The texts have the form of `tests/kit/cases.py`. The head is a robot file, or a 
       hand servo=2 by=-30 at=1300ms    a hand turns a shaft by degrees at once, against the servo
       poke servo=2 max_torque 500      a register before the run, or `... 500 at=1200ms` then
       mute servo=2 at=500ms for=60ms   replies are lost, while the servo executes its instructions
+      busy at=500ms for=50ms           a cycle takes so much longer
       at 0.2 arm trajectory {points: [{time: 1, positions: [0.7, 0]}]}
       at 0.9 cancel {controller: arm}
       at 1 head positions {positions: [0.1]} for 0.2 s     a stream that ends so long after
@@ -19,14 +20,15 @@ The texts have the form of `tests/kit/cases.py`. The head is a robot file, or a 
 
 Expected are each goal that ends, events (`=> event arm turns...`, `=> no event ...`; `any` is each source;
 `=> times 4 arm turns...` counts them), shafts, deg from the reference, and columns of the log: `=> position
-elbow from 1.5 to 2: 0.29 to 0.31`, with `spread` before the numbers for the difference of the largest and the
-smallest one, `step` for the largest one of neighbours, `bend` for that of two steps, `in 100 ms` for the
-largest change in a time, `most` for the largest amount. Without a time it is the last cycle. `=> topic
+elbow from 1.5 to 2: 0.29 to 0.31`, with `spread` before the numbers for the difference of the largest and
+the smallest one, `step` for the largest one of neighbours, `bend` for that of two steps, `in 100 ms` for
+the largest change in a time, `most` for the largest amount. Without a time it is the last cycle. `=> topic
 /pid/state: 0 to 30` is about the ms between its messages, `=> lasts 1.5 to 2 s` about the whole run. `=>
-wrote 1 led: 1 0` has the values that a servo was sent, by the ledger, and `=> sent 1/goal_velocity from 1 to
-2: step 0 to 4` measures them. `...` stands for any text. Each run is equal to its replay. `needs physics`
-names an extra. A case may have several runs: by `NAME = a | b` its `NAME` stands for one text after the
-other, and two do by `NAME OTHER = a ; b | c ; d`, and by more lines of the same names.
+wrote 1 led: 1 0` has the values that a servo was sent, by the ledger, `=> sent 1/goal_velocity from 1 to 2:
+step 0 to 4` measures them, and `=> goals 1: 30 32` has the addresses of its goals in turn. `...` stands for
+any text. Each run is equal to its replay. `needs physics` names an extra. A case may have several runs: by
+`NAME = a | b` its `NAME` stands for one text after the other, and two do by `NAME OTHER = a ; b | c ; d`,
+and by more lines of the same names.
 """
 
 import json
@@ -34,6 +36,7 @@ import math
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +46,7 @@ import yaml
 from tests.kit.cases import Line, TextCase, read_cases
 from tests.kit.clients import Ask, clients_of
 from tests.kit.line_faults import lose_replies, turn_by_hand
-from tests.kit.wire import values_written
+from tests.kit.wire import SYNC_WRITE, taken_apart, values_written, writes
 
 from dxlrun.channels.answers import Completion
 from dxlrun.channels.event_records import EventCode
@@ -75,6 +78,7 @@ class Story:
         self.play, self.asks, self.faults = list[Path | str](), list[Ask](), list[Any]()
         self.hands: list[tuple[int, float, int]] = []
         self.mute: list[tuple[int, ...]] = []
+        self.busy: list[tuple[int, ...]] = []
         self.pokes: list[tuple[int, str, int, int]] = []
         self.goals: list[dict[str, Any]] = []
         self.shafts: dict[int, list[float]] = {number: [] for number in shafts}
@@ -103,6 +107,10 @@ class Story:
             match = re.fullmatch(r"servo=(\d+) at=(\d+)ms for=(\d+)ms", rest)
             assert match, "write mute servo=ID at=TIMEms for=TIMEms"
             self.mute.append(tuple(map(int, match.groups())))
+        elif word == "busy":
+            match = re.fullmatch(r"at=(\d+)ms for=(\d+)ms", rest)
+            assert match, "write busy at=TIMEms for=TIMEms"
+            self.busy.append(tuple(1_000_000 * int(one) for one in match.groups()))
         elif word == "poke":
             servo, item, value, *at = rest.removeprefix("servo=").split()
             at_ms = int(at[0].removeprefix("at=").removesuffix("ms")) if at else -1
@@ -136,6 +144,7 @@ class Story:
             poke() if at_ms < 0 else robot.buses[0].at(at_ms * 1_000_000, poke)
         for number, at_ms, for_ms in self.mute:
             lose_replies(robot.buses[0], number, at_ms * 1_000_000, (at_ms + for_ms) * 1_000_000)
+        self._delay(robot)
         self._watch(robot)
         self.result, self.virtual = robot.run(), robot
         answers = [*client.answers.values()]
@@ -148,6 +157,17 @@ class Story:
 
     def _turn(self, servo: SimulatedServo, by: float) -> None:
         turn_by_hand(servo, servo.shaft.angle + by)
+
+    def _delay(self, robot: VirtualRobot) -> None:
+        hardware, clock, busy = robot.robot.hardware, robot.clock, [*self.busy]
+        read = hardware.read_states
+
+        def read_late() -> None:
+            if busy and clock.now_ns() >= busy[0][0]:
+                clock.wait_until(clock.now_ns() + busy.pop(0)[1])
+            read()
+
+        hardware.read_states = read_late  # type: ignore[method-assign]
 
     def _watch(self, robot: VirtualRobot) -> None:
         for bus in robot.buses:
@@ -187,6 +207,9 @@ class Story:
             item, _, values = rest.partition(":")
             found = [value for _, value in self._written(int(servo), item)]
             assert found == [int(value) for value in values.split()], found
+        elif word == "goals":
+            servo, _, addresses = rest.partition(": ")
+            assert [*map(str, self._goal_addresses(int(servo)))] == addresses.split()
         elif word == "fails":
             assert matches(f"{self.result.reason}, then {self.result.last}: {self.result.detail}", rest)
             self.result = None
@@ -200,6 +223,17 @@ class Story:
                 low - 1e-9 <= one <= high + 1e-9 or (math.isnan(one) and math.isnan(low)) for one in found
             ]
             assert all(inside), (min(found), max(found))
+
+    def _goal_addresses(self, number: int) -> list[int]:
+        """Return the first address of each goal that a servo was sent, by the ledger; none twice in turn."""
+        found = []
+        for bus in self.virtual.plan.buses:
+            entries = [one for one in self.virtual.ledger.entries if one.bus == bus.name]
+            for sent in taken_apart(entries, bus.protocol):
+                if sent.instruction == SYNC_WRITE:
+                    written = writes(sent, bus.protocol)
+                    found += [address for servo, address, _ in written if servo == number]
+        return [address for address, _ in groupby(found)]
 
     def _written(self, number: int, name: str) -> Iterator[tuple[float, int]]:
         """Yield the values of an item that a servo was sent, by the ledger, each with its time, s."""
