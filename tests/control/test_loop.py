@@ -69,7 +69,7 @@ def test_a_stop_ends_after_a_whole_cycle(robot):
     assert (result.reason, result.cycles, result.detail) == ("stopped", 3, "")
     assert len(robot.hardware.written) == 3
     assert [call.step for call in robot.calls] == ["activate", "update", "update", "update", "deactivate"]
-    assert robot.events.seen[-1][:2] == (EventCode.LOOP_STOPPED, Severity.INFO)
+    assert robot.events.list[-1][:2] == (EventCode.LOOP_STOPPED, Severity.INFO)
 
 
 @pytest.mark.parametrize("step", ["read_states", "write_goals", "idle"])
@@ -87,7 +87,7 @@ def test_a_lost_port_ends_the_loop_with_a_sentence(robot, step):
     assert (result.reason, result.cycles) == ("fault", 2)
     assert result.detail == "the adapter of bus main is unplugged"
     assert robot.calls[-1].step == "deactivate"
-    assert robot.events.seen[-1][:2] == (EventCode.LOOP_STOPPED, Severity.FATAL)
+    assert robot.events.list[-1][:2] == (EventCode.LOOP_STOPPED, Severity.FATAL)
 
 
 def test_a_fault_while_deactivating_is_a_fault_of_the_run(robot):

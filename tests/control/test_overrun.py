@@ -79,7 +79,7 @@ def test_a_plug_in_that_fails_is_an_event_and_not_asked_again(robot, decide, why
     hook = OverrunHook("mine (x 1)", lambda *times: asked.append(times) or decide(*times))
     assert ran(robot, "skip", hook, late=(1, 3), periods=12) == [0, 1, 4, 5, 8, 9, 10, 11]
     assert len(asked) == 1
-    told = [(*one[:2], one[3]) for one in robot.events.seen if one[2] == "mine (x 1)"]
+    told = [(*one[:2], one[3]) for one in robot.events.list if one[2] == "mine (x 1)"]
     assert told == [
         (
             EventCode.OVERRUN,

@@ -45,12 +45,28 @@ class Reading:
         self.found[servo_id] = (reply.error, bytes(reply.parameters), reply.last_ns)
 
 
-class Sink:
+class DeskLog(PacketLog):
+    """A log with memory for the packets that the kernel records."""
+
     def __init__(self):
-        self.packets = []
+        self.packets, self._records, self._used = [], memoryview(bytearray(1 << 16)), memoryview(bytearray(8))
+
+    @property
+    def desk(self):
+        return Desk(self._records, self._used.cast("Q"))
 
     def packet(self, _, kind, servo_id, first_ns, last_ns, data):
+        self.commit_packets()
         self.packets.append((kind, bytes(data), last_ns))
+
+    def commit_packets(self):
+        at, end = 0, int.from_bytes(self._used, "little")
+        while at < end:
+            _, kind, _, size, _, last_ns = RECORD.unpack_from(self._records, at)
+            at += RECORD.size
+            self.packets.append((PacketKind(kind), bytes(self._records[at : at + size]), last_ns))
+            at += size
+        self._used[:] = bytes(8)
 
 
 class EngineHost(Host):
@@ -67,7 +83,7 @@ class EngineHost(Host):
         self._reads = (
             [line.read_range(*one) for one in entries] if singles else [line.read_many(entries, fast=fast)]
         )
-        self.sink = Sink()
+        self.sink = DeskLog()
         ports, clock = self.open()
         self.lines = Lines([make_plan(IDS, protocol=protocol, model=MODELS[way])], ports, clock, self.sink)
 
@@ -137,30 +153,6 @@ class TerminalHost(EngineHost):
     def close(self):
         os.close(self.servos)
         os.close(self.host)
-
-
-class DeskLog(PacketLog):
-    """A log with memory for the packets that the kernel records."""
-
-    def __init__(self):
-        self.packets, self._records, self._used = [], memoryview(bytearray(1 << 16)), memoryview(bytearray(8))
-
-    @property
-    def desk(self):
-        return Desk(self._records, self._used.cast("Q"))
-
-    def packet(self, _, kind, servo_id, first_ns, last_ns, data):
-        self.commit_packets()
-        self.packets.append((kind, bytes(data), last_ns))
-
-    def commit_packets(self):
-        at, end = 0, int.from_bytes(self._used, "little")
-        while at < end:
-            _, kind, _, size, _, last_ns = RECORD.unpack_from(self._records, at)
-            at += RECORD.size
-            self.packets.append((PacketKind(kind), bytes(self._records[at : at + size]), last_ns))
-            at += size
-        self._used[:] = bytes(8)
 
 
 class ScriptHost(EngineHost):

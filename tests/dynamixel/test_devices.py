@@ -336,7 +336,7 @@ def storm(rig, chance, ids, kinds):
     """Do something to the line, to a device, or to a servo."""
     servo_id = chance.choice(ids)
     if chance.random() < 0.3:
-        rig.buses[0].at(rig.clock.now_ns(), lambda: node(rig, servo_id).silence(chance.random() < 0.4))
+        rig.buses[0].at(rig.clock.now_ns(), lambda: rig.servo(servo_id).silence(chance.random() < 0.4))
         return
     if not (rig.sources.valid.all() and rig.states.valid.all()):
         return  # it waits for a reply, and would still wait at the end
@@ -346,10 +346,6 @@ def storm(rig, chance, ids, kinds):
     now_ns = rig.clock.now_ns()
     script = FaultScript([parse_fault(text)], chance.randrange(1000))
     script.attach(rig.buses, start_ns=now_ns, now_ns=now_ns)
-
-
-def node(rig, servo_id):
-    return rig.servo(servo_id)
 
 
 @campaign(ci=2, night=50, release=400)
@@ -397,7 +393,7 @@ def test_a_storm_makes_no_state_old_and_costs_the_servos_nothing(number, chance)
             storm(rig, chance, ids, kinds)
         run_cycle(cycle)
     for servo_id in ids:  # behind what the storm has still to do
-        rig.buses[0].at(rig.clock.now_ns(), partial(node(rig, servo_id).silence, on=False))
+        rig.buses[0].at(rig.clock.now_ns(), partial(rig.servo(servo_id).silence, on=False))
     for cycle in range(200, 360):
         run_cycle(cycle)
     assert rig.sources.valid.all()

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 from tests.kit.campaigns import campaign
-from tests.kit.rigs import Events, make_plan, make_rig, make_x, start_rig
+from tests.kit.kept_events import Events
+from tests.kit.rigs import make_plan, make_rig, make_x, start_rig
 
 from dxlrun.channels.event_records import EventCode
 from dxlrun.dynamixel.wire_reports import WireReports

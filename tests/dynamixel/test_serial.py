@@ -286,11 +286,8 @@ MS = 1_000_000
 
 
 @pytest.fixture
-def line():
-    master, slave = os.openpty()
-    yield os.ttyname(slave)
-    os.close(master)
-    os.close(slave)
+def line(terminal):
+    return terminal[1]
 
 
 def timer_of(tmp_path, port, text):

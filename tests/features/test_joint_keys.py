@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from msgspec import structs
-from tests.kit.rigs import Events
+from tests.kit.kept_events import Events
 from tests.kit.robots import compile_text, problems_in
 
 from dxlrun.channels.cycle import Commands, States

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
+from tests.kit.kept_events import Events
 
 from dxlrun.channels.answers import Refusal
 from dxlrun.channels.commands import LOOP, CommandMessage, QueueInbox
@@ -109,26 +110,6 @@ def following(context: Any, *_: object) -> None:
     """Command the references, and where the joints are where there is none."""
     given = context.references.position
     np.copyto(context.commands.position, np.where(np.isnan(given), context.states.position, given))
-
-
-@dataclass
-class Events:
-    seen: list[tuple[EventCode, Severity, str, str]] = field(default_factory=list)
-    data: list[bytes] = field(default_factory=list)
-    """Data of each event that was seen."""
-
-    def emit_event(self, source: str, event: EventBody, data: bytes = b"") -> None:
-        self.seen.append((event.code, event.severity, source, event.text))
-        self.data.append(data)
-
-    def data_of(self, code: EventCode) -> list[bytes]:
-        return [data for seen, data in zip(self.seen, self.data, strict=True) if seen[0] == code]
-
-    def of(self, code: EventCode) -> list[tuple[str, str]]:
-        return [(source, text) for seen, _, source, text in self.seen if seen == code]
-
-    def texts(self, code: EventCode) -> list[str]:
-        return [text for _, text in self.of(code)]
 
 
 @dataclass

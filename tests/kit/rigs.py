@@ -27,11 +27,11 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 from tests.kit.bus_ports import BusPorts
 from tests.kit.decoded import decode_packets
+from tests.kit.kept_events import Events
 from tests.kit.line_faults import corrupt_next, truncate_next
 from tests.kit.plans import make_plan
 
 from dxlrun.channels.cycle import Commands, SourceStates, States, Torque
-from dxlrun.channels.event_records import EventBody, EventCode, Severity
 from dxlrun.channels.logged_packets import LoggedPacket, PacketBatch
 from dxlrun.channels.ring import Handover
 from dxlrun.dynamixel.bus_part import FeatureParts
@@ -71,25 +71,6 @@ class Packets(PacketBatch):
 
     def received(self, bus: int = 0) -> bytes:
         return b"".join(p.data for p in self.list if p.bus == bus and p.kind is not PacketKind.INSTRUCTION)
-
-
-@dataclass
-class Events:
-    """Takes events and keeps them."""
-
-    list: list[tuple[EventCode, Severity, str, str]] = field(default_factory=list)
-
-    def emit_event(self, source: str, event: EventBody, data: bytes = b"") -> None:
-        self.list.append((event.code, event.severity, source, event.text))
-
-    def of(self, code: EventCode) -> list[tuple[str, str]]:
-        return [(source, text) for kind, _, source, text in self.list if kind == code]
-
-    def texts(self, code: EventCode) -> list[str]:
-        return [text for _, text in self.of(code)]
-
-    def sources(self, code: EventCode) -> list[str]:
-        return [source for source, _ in self.of(code)]
 
 
 @dataclass

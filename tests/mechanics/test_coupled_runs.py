@@ -5,8 +5,8 @@ from functools import partial
 
 import pytest
 from msgspec.structs import replace
+from tests.kit.kept_events import Events
 from tests.kit.line_faults import turn_by_hand
-from tests.kit.rigs import Events
 from tests.kit.sampled_run import SampledRun
 from tests.kit.stories import send
 from tests.kit.wire import all_writes

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from msgspec.structs import replace
-from tests.kit.rigs import Events
+from tests.kit.kept_events import Events
 from tests.kit.stories import replayed
 
 from dxlrun import features
