@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from tests.kit.robots import PAIR, compile_text, problems_in
 
+from dxlrun.compile.joints.poses import Poses, WrongPose
 from dxlrun.compile.motion_samples import LONGEST_FORMULA, Expression
 from dxlrun_controllers.laws.spline import SplineSample, Trajectory
 
@@ -111,3 +112,9 @@ def test_what_is_no_formula_is_refused_with_a_sentence(text: str, says: str):
 def test_where_a_formula_has_no_value_it_says_why(text: str, says: str):
     with pytest.raises(ValueError, match=says):
         Expression(text).at(0.0)
+
+
+def test_a_pose_without_positions_has_its_problem_as_data():
+    with pytest.raises(WrongPose) as wrong:
+        Poses({"up": {"a": 0.1}}).find_positions("up;\ndown; now")
+    assert wrong.value.problems == (("the robot has no pose up;\ndown; now", "known: up"),)

@@ -223,7 +223,12 @@ def _good_value(error: _Error) -> object:
 
 
 def sentences_of(error: ValidationError, what: str, model: type[BaseModel], most: int) -> list[str]:
-    """Convert pydantic's errors about data that is not from a file into sentences `problem; fix`.
+    """Convert pydantic's errors as `data_problems`, into sentences `problem; fix`."""
+    return [f"{problem.what}; {problem.fix}" for problem in data_problems(error, what, model, most)]
+
+
+def data_problems(error: ValidationError, what: str, model: type[BaseModel], most: int) -> list[Problem]:
+    """Convert pydantic's errors about data that is not from a file into problems without a place.
 
     Args:
         error: The model's errors.
@@ -236,8 +241,7 @@ def sentences_of(error: ValidationError, what: str, model: type[BaseModel], most
         # the step names a member of a union
         location = [part for part in details["loc"] if not str(part).startswith("<")]
         places |= {(what, *location[:end]): Mark(what) for end in range(len(location) + 1)}
-    problems = problems_of(error, Marks(what, places, places), (what,), model=model, most=most)
-    return [f"{problem.what}; {problem.fix}" for problem in problems]
+    return problems_of(error, Marks(what, places, places), (what,), model=model, most=most)
 
 
 class _Error:

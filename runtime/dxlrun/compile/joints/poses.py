@@ -18,7 +18,7 @@ from pydantic import BaseModel, ValidationError
 from dxlrun.contract.named_pose import NAMED_POSE, PoseStage
 from dxlrun.description.base_form import ParametersModel
 from dxlrun.description.document import KeyPath
-from dxlrun.description.form_problems import sentences_of
+from dxlrun.description.form_problems import data_problems
 from dxlrun.errors import suggestion, what_and_fix
 from dxlrun.features import installed_features, stages
 from dxlrun.plan.loop_plan import JointPlan
@@ -29,15 +29,14 @@ _EACH: Final = -1
 
 
 class WrongPose(ValueError):
-    """Raised for a pose without positions of joints; its text has a line `problem; fix` for each problem.
+    """Raised for a pose without positions of joints, with each problem and its fix.
 
-    It is empty if the mistake is already reported.
+    There are none if the mistake is already reported.
     """
 
-    @property
-    def problems(self) -> list[tuple[str, str]]:
-        """Problems with their fixes."""
-        return [*map(what_and_fix, str(self).splitlines())]
+    def __init__(self, *problems: tuple[str, str]) -> None:
+        super().__init__("; ".join(map("; ".join, problems)))
+        self.problems = problems
 
 
 class Poses(msgspec.Struct, frozen=True):
@@ -76,9 +75,10 @@ class Poses(msgspec.Struct, frozen=True):
         try:
             return stage.solve(stage.form.model_validate(written), self.urdf, self.joints)
         except ValidationError as error:
-            raise WrongPose("\n".join(sentences_of(error, "the pose", stage.form, _MOST_MISTAKES))) from None
+            found = data_problems(error, "the pose", stage.form, _MOST_MISTAKES)
+            raise WrongPose(*((problem.what, problem.fix) for problem in found)) from None
         except ValueError as error:
-            raise WrongPose(str(error)) from None
+            raise WrongPose(what_and_fix(error)) from None
 
     def find_named(self, name: str) -> Mapping[str, float]:
         """Return the positions of the pose with a name; raise WrongPose as `find_positions`."""
@@ -88,10 +88,10 @@ class Poses(msgspec.Struct, frozen=True):
             raise WrongPose
         if name in self.named:
             joints = ", ".join(self.omitted)
-            raise WrongPose(f"pose {name} needs a joint that is omitted ({joints}); run with {joints}")
+            raise WrongPose((f"pose {name} needs a joint that is omitted ({joints})", f"run with {joints}"))
         known = [each for each, positions in self.named.items() if positions]
         fix = suggestion(name, known) if known else "add it to `poses` of the robot file"
-        raise WrongPose(f"the robot has no pose {name}; {fix}")
+        raise WrongPose((f"the robot has no pose {name}", fix))
 
     def put_in(
         self, written: object, model: type[BaseModel]
