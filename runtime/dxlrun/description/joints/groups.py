@@ -39,15 +39,16 @@ def with_groups(grown: PlainDocument) -> PlainDocument:
     data = grown.data
     if DEFAULTS not in data and GROUPS not in data:
         return grown
-    groups = _groups(data)
     grown = replace(grown, problems=(*grown.problems, *_mistakes(grown)))
+    if not isinstance(data.get("joints"), dict):
+        # The missing joints are the only mistake; layers would make joints, and groups would be empty.
+        return _without_defaults(grown, NO_GROUPS)
+    groups = _groups(data)
     # Lowest precedence first: defaults, then groups, then the joints' own keys.
     layers = [_layer(grown, (DEFAULTS,), tuple(_mapping(data.get("joints"))), groups)]
     layers += [_layer(grown, (GROUPS, name), joints, groups) for name, joints in groups.items()]
     grown = replace(grown, problems=(*grown.problems, *_disagreements(grown, groups, layers[1:])))
-    own = _without_defaults(grown, groups)
-    # Layers would make joints, which then would not be reported as missing.
-    return put_in(merged([*layers, own] if "joints" in data else [own]), groups)
+    return put_in(merged([*layers, _without_defaults(grown, groups)]), groups)
 
 
 def put_in(grown: PlainDocument, groups: Groups) -> PlainDocument:
@@ -150,7 +151,7 @@ def _mapping(value: object) -> dict[str, object]:
 
 def _mistakes(grown: PlainDocument) -> Iterator[Problem]:
     """Yield problems in `joint_defaults` and `groups`: unknown joints, ambiguous names, cycles."""
-    joints, entries = _mapping(grown.data.get("joints")), _named(grown.data)
+    joints, entries = grown.data.get("joints"), _named(grown.data)
     if not isinstance(defaults := grown.data.get(DEFAULTS, {}), dict):
         what = f"{DEFAULTS} is {format_value(defaults)}, but must be a mapping"
         yield Problem(grown.marks.value(DEFAULTS), what, f"write keys of a joint below {DEFAULTS}")
@@ -166,7 +167,7 @@ def _mistakes(grown: PlainDocument) -> Iterator[Problem]:
     for name in entries:
         for index, one in _written(entries, name):
             mark = grown.marks.value(GROUPS, name, "joints", index)
-            if one not in joints and one not in entries:
+            if isinstance(joints, dict) and one not in joints and one not in entries:
                 what = f"joint {one} of group {name} is not defined"
                 yield Problem(mark, what, suggestion(one, (*joints, *entries)))
             elif circle := _circle(entries, (name, one)):
