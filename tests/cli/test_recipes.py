@@ -149,16 +149,20 @@ def test_the_notebook_moves_the_torso_and_draws_it(run: Run, live: LiveRobot) ->
 
     mpl.use("Agg")
     try:
-        seen = run("\n".join(CELLS))["seen"]
+        ran = run("\n".join(CELLS))
         lines = {str(line.get_label()): np.asarray(line.get_xydata()) for line in plt.gca().get_lines()}
     finally:
         plt.close("all")
+    seen = ran["seen"]  # of 100 cycles: a busy machine skips some, and reads others after the end of the goal
     assert len(lines) == 3
-    assert len(seen) > 50  # of about 100: a busy machine leaves cycles out
-    elbow = lines["left_elbow_joint"]
-    assert elbow[-1, 0] == pytest.approx(2.0, abs=0.5)
-    assert elbow[:, 1].max() == pytest.approx(0.6, abs=0.1)
-    assert elbow[-1, 1] == pytest.approx(0.0, abs=0.1)
+    assert len(seen) > 1
+    for joint, drawn in lines.items():
+        at = seen[0].joints.index(joint)
+        assert drawn[:, 1].tolist() == [one.message["position"][at] for one in seen]
+        assert drawn[:, 0] * 1e9 == pytest.approx([one.time_ns - seen[0].time_ns for one in seen])
+    with connect() as torso:
+        assert torso.wait(ran["arm"].number).status == "reached"
+        assert abs(torso.states().joint("left_elbow_joint")["position"]) < 0.1
 
 
 def test_react_to_an_event(
