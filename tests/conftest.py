@@ -31,10 +31,11 @@ gc.set_threshold(50_000, 20, 20)  # as in `dxlrun`: the many tests that are coll
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
     """Use all cores for the whole suite, and this process alone for what is named.
 
-    Tests wait for robots in real time for a third of their time, so three workers fill two cores.
+    Tests wait for robots in real time for a third of their time, long ones for half of it: three workers fill
+    two cores, or four of them with `--all`.
     """
     whole = config.args_source is not pytest.Config.ArgsSource.ARGS
-    return (os.cpu_count() or 1) * 3 // 2 if whole else 0
+    return (os.cpu_count() or 1) * (4 if config.getoption("--all") else 3) // 2 if whole else 0
 
 
 EXTRAS: dict[str, tuple[str, ...]] = {
