@@ -18,15 +18,6 @@ def first(robot, name="position"):
     return robot.sink.cycles[0][name].tolist()
 
 
-def test_a_reference_reaches_the_servo_and_the_record_in_the_cycle_that_commands_it(robot):
-    robot.script("lower", following, command=("position",), reference=("position", "effort"))
-    robot.script("upper", commanding(position=[0.1, 0.2]), **UPPER)
-    assert first(robot) == [0.1, 0.2]
-    names = [f"lower/{joint}/{name}" for name in ("position", "effort") for joint in ("j0", "j1")]
-    assert robot.record.layout.references == tuple(names)
-    np.testing.assert_array_equal(robot.sink.cycles[0]["reference"], [0.1, 0.2, NAN, NAN])
-
-
 @pytest.mark.parametrize("joints", [("j0", "j1"), ("j1", "j0"), ("j3", "j0", "j2")])
 def test_joints_of_both_ends_are_matched_by_their_names(joints):
     robot = Robot(joints=4).script("lower", following, joints=("j2", "j0", "j3", "j1"), **LOWER)

@@ -143,21 +143,6 @@ def test_commands_come_at_the_first_cycle_that_is_not_too_early(robot):
     assert robot.column("command_count") == [0, 1, 1, 0]
 
 
-def test_commands_to_controllers_that_are_not_there_are_refused_in_words(robot):
-    robot.script("asleep", active=False)
-    for name in ("asleep", "unknown"):
-        robot.send(0, name, "go")
-    assert robot.run(2).reason == "stopped"
-    assert robot.events.of(EventCode.COMMAND_REFUSED) == [
-        (
-            "asleep",
-            "go from motion.yaml:7:5 refused: asleep is not active; "
-            "activate it by `dxlrun switch --activate asleep`",
-        ),
-        ("unknown", "go from motion.yaml:7:5 refused: there is no controller unknown"),
-    ]
-
-
 def test_a_controller_is_updated_at_its_own_rate_with_its_true_period_at_most_five_nominal_ones(robot):
     robot.script("slow", every=3, joints=("j0",)).script("patient", joints=("j1",))
     robot.run(work={4: 3.5, 15: 50.0}, end_ns=80 * PERIOD_NS)

@@ -196,19 +196,16 @@ def test_key_of_plugin_with_name_of_the_core_is_refused(offer, name, file):
     }
 
 
-def test_key_that_a_form_cannot_have_is_refused(offer):
-    assert "does not begin with a letter" in offer("_lamps", "joint_key")[2]["_lamps"]
-
-
-def test_key_that_is_not_the_name_of_its_feature_is_refused(offer):
-    assert (
-        "joint_key.py, servo_key.py or policy_key.py declares it"
-        in (offer("lamps", "joint_key", declared="bus")[2]["lamps"])
-    )
-
-
-def test_key_of_joints_and_of_servos_is_refused(offer):
-    assert "both for joints and for servos" in offer("glow", "joint_key", "servo_key")[2]["glow"]
+@pytest.mark.parametrize(
+    ("name", "files", "declared", "said"),
+    [
+        ("_lamps", ["joint_key"], "", "does not begin with a letter"),
+        ("lamps", ["joint_key"], "bus", "joint_key.py, servo_key.py or policy_key.py declares it"),
+        ("glow", ["joint_key", "servo_key"], "", "both for joints and for servos"),
+    ],
+)
+def test_key_that_cannot_be_is_refused(offer, name, files, declared, said):
+    assert said in offer(name, *files, declared=declared)[2][name]
 
 
 def test_key_before_an_unknown_one_is_the_last(offer):

@@ -72,7 +72,9 @@ def run(path: Path, policies: str) -> Ended:
     bus.at(900_000_000, lambda: torque.extend(bus.servo(one).torque_on for one in (3, 7)))
     bus.at(1_000_000_000, lambda: heat(40.0))
     result = robot.run()
-    read = read_log(log)
+    read, report = read_log(log), replay_log(log)
+    assert (report.compared, report.different, report.fault) == (len(read.cycles), 0, "")
+    assert not any("not installed" in remark for remark in report.remarks)
     events = [(event.source, event.text) for event in read.events if event.code == EventCode.POLICY]
     return Ended(result.reason, result.detail, torque, events, read)
 
@@ -170,14 +172,6 @@ def test_robot_without_the_key_does_not_use_the_package(tmp_path):
     assert "dxlrun_hot" not in plan_of(file).packages
     file.write_text(ROBOT + HOT % "limp")
     assert plan_of(file).packages["dxlrun_hot"] == "dxlrun-hot"
-
-
-@pytest.mark.parametrize("policies", [HOT % "limp", HOT % "hold", HOT % "stop", OVERHEAT])
-def test_replay_decides_like_the_run(tmp_path, policies):
-    ended = run(tmp_path, policies)
-    report = replay_log(tmp_path / "run.mcap")
-    assert (report.compared, report.different, report.fault) == (len(ended.log.cycles), 0, "")
-    assert not any("not installed" in remark for remark in report.remarks)
 
 
 def test_replay_without_the_package_says_so(tmp_path, monkeypatch):

@@ -93,23 +93,18 @@ def test_robot_without_the_key_does_not_use_the_package():
     assert "dxlrun_glow.settings" not in sys.modules
 
 
-def test_mistake_has_the_place_of_the_key():
-    text = ROBOT.replace("id: 4, glow: false", "id: 4, glow: maybe")
-    with pytest.raises(
-        InputError, match=r"robot.yaml:10:42: joints.both.servos\[1\].glow is the text 'maybe'"
-    ):
-        compile_text(text)
-
-
-def test_setting_that_the_model_does_not_have_is_refused():
-    text = ROBOT.replace("id: 2}", "id: 2, model: PH42-020-S300-R, glow: true}")
-    with pytest.raises(InputError, match="cannot glow"):
-        compile_text(text)
-
-
-def test_joint_of_a_transmission_does_not_have_the_key():
-    with pytest.raises(InputError, match="roll"):
-        compile_text(ROBOT.replace("roll: {}", "roll: {glow: true}"))
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("glow: false", "glow: maybe", r"yaml:10:42: joints.both.servos\[1\].glow is the text 'maybe'"),
+        ("id: 2}", "id: 2, model: PH42-020-S300-R, glow: true}", "cannot glow"),
+        ("roll: {}", "roll: {glow: true}", "roll"),
+    ],
+)
+def test_mistake_is_named_at_its_place(old, new, said):
+    assert old in ROBOT
+    with pytest.raises(InputError, match=said):
+        compile_text(ROBOT.replace(old, new))
 
 
 def test_every_form_of_a_servo_is_in_the_schema():

@@ -6,7 +6,6 @@ import tomllib
 from pathlib import Path
 
 import pytest
-import rustypot
 from tests.kit.cases import TextCase, case_parameters, read_head
 
 import dxlwire.control_table
@@ -159,11 +158,6 @@ def test_a_file_that_extends_nothing_or_itself_is_refused(entries: dict[str, dic
 
 AX = find_table("AX-12A")
 AX_TEXT = (Path(dxlwire.control_table.__file__).parent / "tables/protocol1/AX-12A.toml").read_text("utf-8")
-
-
-def test_the_model_number_is_that_of_a_foreign_list() -> None:
-    assert AX.model_number in rustypot.AxPyController.models().values()
-    assert AX.items["model_number"].initial == AX.model_number
 
 
 def test_units_are_exact_and_not_the_rounded_ones_of_the_manual() -> None:
