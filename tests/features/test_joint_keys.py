@@ -9,6 +9,7 @@ import pytest
 from msgspec import structs
 from tests.kit.kept_events import Events
 from tests.kit.robots import compile_text, problems_in
+from tests.kit.stories import replayed
 
 from dxlrun.channels.cycle import Commands, States
 from dxlrun.cli import check
@@ -16,7 +17,8 @@ from dxlrun.description.joints import joint_forms
 from dxlrun.description.joints.joint_forms import kind_of_joint
 from dxlrun.description.json_schema import robot_schema
 from dxlrun.description.robot import robot_form
-from dxlrun.dynamixel.hardware_layer import HardwareLayers
+from dxlrun.dynamixel.hardware_layer import HardwareLayer, HardwareLayers
+from dxlrun.features.mechanics.joint_hardware import JointHardware
 from dxlrun.plan.loop_plan import JointValues
 from dxlrun.plan.robot_plan import from_json, to_json
 from dxlrun.testing import installed, simulated_robot
@@ -95,6 +97,11 @@ def test_layer_of_a_joint_key_is_above_the_servos_of_couplings():
     joints, servos = len(plan.loop.joints), len(plan.mechanics.servos)
     layers = HardwareLayers(plan, States.empty(joints), Commands.empty(joints), Events())
     assert [len(layer.goals.position) for layer in layers._layers] == [joints, servos]
+    assert len(layers.goals.position) == servos > joints
+    assert layers.refusals is not None
+    built = layers.build(HardwareLayer(None))
+    assert type(built).__name__ == "BacklashLayer"
+    assert isinstance(built._hardware, JointHardware)
 
 
 def test_check_of_the_feature_names_the_place():
@@ -172,7 +179,8 @@ def test_goals_go_on_by_half_of_the_play(tmp_path):
         "      - {time: 0.1 s, joints: {knee: {position: 10 deg}, ankle: {position: 10 deg}}}\n"
         "      - {time: 1.0 s, joints: {knee: {position: 5 deg}, ankle: {position: 5 deg}}}\n"
     )
-    robot = simulated_robot(tmp_path / "robot.yaml", play=[motion], duration_s=2.0)
+    log = tmp_path / "run.mcap"
+    robot = simulated_robot(tmp_path / "robot.yaml", play=[motion], duration_s=2.0, log=log)
     goals: list[list[float]] = []
     for at_s in (0.9, 1.9):
         robot.buses[0].at(
@@ -187,3 +195,4 @@ def test_goals_go_on_by_half_of_the_play(tmp_path):
     robot.run()
     expected = [[np.radians(12), np.radians(10)], [np.radians(3), np.radians(5)]]
     np.testing.assert_allclose(goals, expected, atol=RAD_PER_TICK)
+    assert replayed(log).cycles["goal_position"][-1] == pytest.approx(np.radians(5)), "the log has the joints"
