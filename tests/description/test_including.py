@@ -10,8 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.kit import desk
+from tests.kit.cases import read_head
 from tests.kit.desk import TORSO
-from tests.kit.robots import robot_text
+from tests.kit.robots import CASES, robot_text
 
 from dxlrun.description.document import KeyPath, confined, grow, literal, parse, read_file
 from dxlrun.description.including import MOST_FILES, MOST_LEVELS, merged
@@ -76,15 +77,7 @@ def test_without_a_block_there_are_no_arguments() -> None:
     assert "has no" in second
 
 
-HEAD = """\
-arguments:
-  speed: {default: 1 rad/s, help: of the head}
-  port: {default: /dev/ttyUSB9, help: "of the fragment"}
-joints:
-  yaw: {bus: main, id: 21, model: AX-12A, reference: 150 deg, direction: 1, limits: {velocity: "${speed}"}}
-controllers:
-  head: {type: joint_group_position_controller, joints: [yaw]}
-"""
+HEAD = read_head(CASES / "included.txt").partition("---- head.yaml\n")[2]
 
 
 @pytest.fixture
