@@ -35,7 +35,7 @@ from dxlrun import (
     RobotModel,
 )
 from dxlrun.tooling.robots import FrameTree, Transform, read_urdf, rotated
-from dxlrun_space.chain import BASE, Chain, Vector, WrongChain, shifted
+from dxlrun_space.chain import BASE, Chain, WrongChain, shifted
 from dxlrun_space.path import (
     MotionLimits,
     NoPath,
@@ -48,7 +48,7 @@ from dxlrun_space.path import (
 )
 from dxlrun_space.solver import Solver, demands_orientation, distance, residual_of
 from dxlrun_space.space_goals import PoseCommand, TwistCommand, packed, unpacked
-from dxlrun_space.stream import TipMotion
+from dxlrun_space.stream import TipMotion, Twist
 
 ACCELERATION: Final = 20.0
 """Acceleration of joints without a limit, rad/s^2; an XM430 stops from its highest speed in 0.25 s."""
@@ -59,7 +59,6 @@ STEP_NS: Final = 300_000
 MOST_STEPS: Final = 50
 """Most steps of a cycle, 2.5 ms."""
 _LONGEST_STOP_S: Final = 2.0
-Twist: TypeAlias = "tuple[Vector, Vector]"
 NO_TWIST: Final[Twist] = (BASE.translation, BASE.translation)
 Task: TypeAlias = "Generator[None, None, None]"
 """Motion that advances by a cycle, or planning by a step, with each `next`."""

@@ -74,7 +74,10 @@ class Chain:
                 before = BASE
         self._steps, self._end = tuple(steps), before
         parts = *(step.fixed for step in steps[1:]), self._end
-        self.length = max(0.01, math.fsum(math.hypot(*part.translation) for part in parts))
+        lengths = [math.hypot(*part.translation) for part in parts]
+        self.links = tuple((step.index, step.slides, part) for step, part in zip(steps, lengths, strict=True))
+        """Joints from the base on: index, True if it slides, and distance to the next one, m."""
+        self.length = max(0.01, math.fsum(lengths))
         """Sum of the distances from the first joint to the tip, m: the scale of the arm."""
         self._axes = [BASE.translation] * len(joints)
         self._origins = [BASE.translation] * len(joints)

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from tests.kit.campaigns import campaign
+from tests.kit.judged_arms import arms
 from tests.kit.stories import replayed
 from tests.kit.wire import values_written
 
@@ -101,6 +102,7 @@ def test_hostile_goals_are_within_the_limits_of_the_joints(
     goals: dict[int, list[tuple[int, int]]] = {}
     for t_ns, servo, value in values_written(robot.ledger.entries, bus, GOAL_POSITION, 4, signed=True):
         goals.setdefault(servo, []).append((t_ns, value))
+    tips, sent = arms()["open_manipulator_x"], list[Any]()
     for joint, servo in zip(plan.loop.joints[:4], (11, 12, 13, 14), strict=True):
         times, ticks = np.array(goals[servo]).T  # a goal that does not change is not sent again
         cycles = np.arange(times[0], times[-1], PERIOD_S * 1e9)
@@ -112,3 +114,10 @@ def test_hostile_goals_are_within_the_limits_of_the_joints(
         speeds = (rows[WINDOW:] - rows[:-WINDOW]) / (WINDOW * PERIOD_S)
         rates = (speeds[WINDOW:] - speeds[:-WINDOW]) / (WINDOW * PERIOD_S)
         assert np.abs(rates).max() <= RATE * 1.05 + 2 * TICK / (WINDOW * PERIOD_S) ** 2
+        sent.append(rows)
+    count = min(map(len, sent))
+    places = np.array(
+        [tips.matrix(row)[:3, 3] for row in np.transpose([row[:count] for row in sent])[::WINDOW]]
+    )
+    speeds = np.linalg.norm(np.diff(places, axis=0), axis=1) / (WINDOW * PERIOD_S)
+    assert speeds.max() <= 0.2 * 1.05 + 2 * TICK * 0.4 / (WINDOW * PERIOD_S)

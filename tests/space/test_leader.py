@@ -114,12 +114,14 @@ def test_the_tip_is_at_the_scaled_pose_with_its_offset() -> None:
 
 def test_a_leader_beyond_reach_is_followed_to_the_edge_and_back() -> None:
     stage, far, near = staged(scale=2.0), (0.0, -0.4, -0.3, 0.0, 0.0), (0.2, 0.4, 0.8, 0.0, 0.0)
-    rows = np.vstack([led(stage, far, 4.0), led(stage, near, 1.5)])
+    rows = np.vstack([led(stage, far, 4.0), led(stage, near, 2.2)])
     assert all(FOLLOWER.within(row) for row in rows)
     assert np.abs(rows[199] - rows[190]).max() < 1e-3, "it rests at the edge"
     assert FOLLOWER.matrix(rows[-1])[:3, 3] == pytest.approx(2 * LEADER.matrix(near)[:3, 3], abs=1e-3)
     assert np.abs(np.diff(rows, axis=0)).max() <= 4.8 * 0.02 * 1.01
     assert np.abs(np.diff(rows, 2, axis=0)).max() <= 20.0 * 0.02**2 * 1.01, "near the edge a joint leaps"
+    tips = np.array([FOLLOWER.matrix(row)[:3, 3] for row in rows])
+    assert np.linalg.norm(np.diff(tips, axis=0), axis=1).max() <= 0.2 * 0.02 + 1e-9, "the tip does not leap"
 
 
 def test_a_leader_that_does_not_answer_is_waited_for() -> None:
