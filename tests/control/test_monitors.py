@@ -9,7 +9,6 @@ from msgspec.structs import replace
 from tests.kit.loops import loop_plan
 
 from dxlrun.channels.cycle import CycleRecord
-from dxlrun.channels.event_records import EventCode, Severity, event_text
 from dxlrun.control.monitors import build_monitors
 from dxlrun.control.monitors.monitor_stage import MonitorStage
 from dxlrun.control.monitors.policy_actions import PolicyActions
@@ -29,44 +28,20 @@ joints:
   pan: {bus: main, id: 3, model: AX-12A, reference: 150 deg, direction: 1}
   tilt: {bus: main, id: 7, model: AX-12A, reference: 150 deg, direction: 1}
 """
-ENDS_S = 0.5
 
 
-@event_text(EventCode.POLICY, Severity.WARNING)
-def is_limp(joint: str) -> str:
-    return f"{joint} is limp"
+class Broken:
+    """Raises in its first cycle."""
 
-
-class FarJoints:
-    """Takes the torque of joint 0 after a while, and ends the run a little later."""
-
-    def __init__(self, actions: PolicyActions) -> None:
-        self.actions = actions
-        self.limp = False
+    error: BaseException = ValueError("no such joint")
 
     @classmethod
     def build(cls, plan: LoopPlan, record: CycleRecord, actions: PolicyActions) -> Self:
         """Return a monitor for every robot."""
-        return cls(actions)
+        return cls()
 
     def check_cycle(self, time_ns: int) -> None:
-        if time_ns > 0.5e9 * ENDS_S and not self.limp:
-            self.limp = True
-            self.actions.make_limp([0])
-            self.actions.report(is_limp("pan"), source="pan")
-        if time_ns > 1e9 * ENDS_S:
-            self.actions.end_run("on_fault", "it is enough")
-            self.actions.end_run("on_exit", "the first reason counts")
-
-
-class Broken(FarJoints):
-    """Raises in one of the cycles."""
-
-    error: BaseException = ValueError("no such joint")
-
-    def check_cycle(self, time_ns: int) -> None:
-        if time_ns > 1e9 * ENDS_S:
-            raise self.error
+        raise self.error
 
 
 class Exiting(Broken):
@@ -78,40 +53,26 @@ class Exiting(Broken):
 class OneMonitor(Feature, frozen=True, kw_only=False):
     """A feature that has a monitor only."""
 
-    monitor: type[FarJoints] = FarJoints
+    monitor: type[Broken] = Broken
 
     def stage(self, kind: type[S]) -> S | None:
         found = MonitorStage(self.monitor)
         return found if isinstance(found, kind) else None
 
 
-def robot_with(monitor: type[FarJoints], path: Path) -> VirtualRobot:
-    file = path / "pair.yaml"
-    file.write_text(ROBOT)
-    plan = plan_of(file, duration_s=2.0)
-    features = (*plan.features, OneMonitor("far_joints", "", "tests 1", monitor))
-    return VirtualRobot(replace(plan, loop=replace(plan.loop, features=features)))
-
-
 @pytest.mark.parametrize(
     ("monitor", "raised"), [(Broken, "ValueError: no such joint"), (Exiting, "SystemExit: 3")]
 )
 def test_monitor_that_raises_ends_the_run_by_on_fault(monitor, raised: str, tmp_path: Path) -> None:
-    robot = robot_with(monitor, tmp_path)
+    file = tmp_path / "pair.yaml"
+    file.write_text(ROBOT)
+    plan = plan_of(file, duration_s=2.0)
+    features = (*plan.features, OneMonitor("broken", "", "tests 1", monitor))
+    robot = VirtualRobot(replace(plan, loop=replace(plan.loop, features=features)))
     result = robot.run()
     detail = f"the monitor {monitor.__name__} of {__name__} raised {raised}; on_fault: limp"
     assert (result.reason, result.detail) == ("fault", detail)
     assert not any(servo.torque_on for servo in robot.buses[0].servos)
-
-
-def test_monitor_of_a_package_acts_in_the_loop(tmp_path: Path) -> None:
-    robot, torque = robot_with(FarJoints, tmp_path), list[bool]()
-    bus = robot.buses[0]
-    bus.at(int(0.9e9 * ENDS_S), lambda: torque.extend(bus.servo(one).torque_on for one in (3, 7)))
-    result = robot.run()
-    assert torque == [False, True]
-    assert (result.reason, result.detail) == ("fault", "it is enough; on_fault: limp")
-    assert result.cycles < 50 * (ENDS_S + 0.1)
 
 
 @pytest.mark.parametrize(
@@ -151,3 +112,6 @@ def test_controllers_are_held_until_no_policy_holds_them() -> None:
     for holder, rows in ((first, {0}), (second, {0, 1}), (first, set()), (second, set())):
         actions.hold_controllers(holder, rows, "are cool")  # two monitors may have the same sentence
     assert [rows for rows, _ in noted.held] == [{0}, {0, 1}, {0, 1}, set()]
+    for policy, why in (("on_fault", "it is enough"), ("on_exit", "only the first reason counts")):
+        actions.end_run(policy, why)
+    assert actions.ending == ("on_fault", "it is enough; on_fault: limp")

@@ -1,27 +1,22 @@
 """The exchange of dxlwire alone, back to back, and how its replies are slept and polled for."""
 
 import ctypes
-import os
-import threading
-import time
-import tty
 
 import pytest
 from msgspec.structs import replace
-from tests.kit.exchanges import IDS, MODELS, GoodReplies, Host, SpoiltReplies
+from tests.kit.exchanges import IDS, MODELS, Host, SpoiltReplies
 from tests.kit.plans import ScriptedLine, make_plan
 
 from dxlwire.bus.blocking_bus import ServoSet
 from dxlwire.bus.programs import Addressed
 from dxlwire.bus.servo_group import ServoGroup
 from dxlwire.bus.session import Session, line_plan
-from dxlwire.clock import MonotonicClock
 from dxlwire.control_table import find_table
 from dxlwire.exchange import kernel
 from dxlwire.exchange.bus_engine import Lines
 from dxlwire.packets import RECORD, Desk, PacketKind, PacketLog
 from dxlwire.plan.line import Line
-from dxlwire.port.ports import AUTO_SHARE, MOST_SHARE, ReplyPolling, SerialPort, SerialPorts
+from dxlwire.port.ports import AUTO_SHARE, MOST_SHARE, ReplyPolling
 from dxlwire.transaction import TransactionOutcome
 from dxlwire.wire import protocol1, protocol2
 
@@ -72,24 +67,18 @@ class DeskLog(PacketLog):
 class EngineHost(Host):
     """A scripted line on virtual time."""
 
-    latency_ns = 0
-
     def __init__(self, way):
         protocol = 1.0 if MODELS[way] in ("AX-12A", "MX-28") else 2.0
         self.dialect = protocol1 if protocol == 1.0 else protocol2
-        line, fast = Line(1_000_000, self.latency_ns, 0, self.dialect), way.startswith("fast")
+        line, fast = Line(1_000_000, 0, 0, self.dialect), way.startswith("fast")
         entries = [(servo_id, *((36, 6) if protocol == 1.0 else (126, 10))) for servo_id in IDS]
         singles = way == "single reads"
         self._reads = (
             [line.read_range(*one) for one in entries] if singles else [line.read_many(entries, fast=fast)]
         )
-        self.sink = DeskLog()
-        ports, clock = self.open()
-        self.lines = Lines([make_plan(IDS, protocol=protocol, model=MODELS[way])], ports, clock, self.sink)
-
-    def open(self):
-        self.line = ScriptedLine()
-        return self.line, self.line.clock
+        self.sink, self.line = DeskLog(), ScriptedLine()
+        plans = [make_plan(IDS, protocol=protocol, model=MODELS[way])]
+        self.lines = Lines(plans, self.line, self.line.clock, self.sink)
 
     def say(self, given):
         self.line.script = [pieces for _, pieces in given]
@@ -120,49 +109,15 @@ class EngineHost(Host):
         return self.lines.buses[0].noise_bytes
 
 
-class TerminalHost(EngineHost):
-    """A pseudo-terminal in real time, on which a thread answers; a reply may be very late."""
-
-    latency_ns = 100_000_000_000
-
-    def open(self):
-        self.servos, self.host = os.openpty()
-        for end in (self.servos, self.host):
-            tty.setraw(end)
-        return SerialPorts([SerialPort(self.host, "pty")]), MonotonicClock()
-
-    def say(self, given):
-        self.thread = threading.Thread(target=self.answer, args=(given,))
-        self.thread.start()
-
-    def answer(self, given):
-        for packet, pieces in given:
-            got = b""
-            while len(got) < len(packet):
-                got += os.read(self.servos, len(packet) - len(got))
-            began = time.monotonic()
-            for at_ns, data in pieces:  # no sooner than the wire allows
-                time.sleep(max(0.0, at_ns / 1e9 + began - time.monotonic()))
-                os.write(self.servos, data)
-
-    def exchange(self, given):
-        valid = super().exchange(given)
-        self.thread.join()
-        return valid
-
-    def close(self):
-        os.close(self.servos)
-        os.close(self.host)
-
-
 class ScriptHost(EngineHost):
     """The reader of a `Bus`, by the kernel if it can."""
 
     def __init__(self, way):
         protocol = 1.0 if MODELS[way] in ("AX-12A", "MX-28") else 2.0
         self.dialect = protocol1 if protocol == 1.0 else protocol2
-        ports, clock = self.open()
-        session = Session(ports, clock, line_plan("line", 1_000_000, protocol, 0), lambda: None)
+        self.line = ScriptedLine()
+        plan = line_plan("line", 1_000_000, protocol, 0)
+        session = Session(self.line, self.line.clock, plan, lambda: None)
         session.log.recording = self.sink = DeskLog()
         self.lines = session.lines
         table = find_table(MODELS[way], protocol)
@@ -200,10 +155,6 @@ class TestVirtualTime(SpoiltReplies):
 
 class TestScript(SpoiltReplies):
     host = ScriptHost
-
-
-class TestRealTime(GoodReplies):
-    host = TerminalHost
 
 
 OK, TIMEOUT, GARBLED, REFUSED = (TransactionOutcome[one] for one in ("OK", "TIMEOUT", "GARBLED", "REFUSED"))

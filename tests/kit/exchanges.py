@@ -51,9 +51,6 @@ class Host:
     def __init__(self, way: str) -> None:
         raise NotImplementedError
 
-    def close(self) -> None:
-        """Release what it opened."""
-
     def reads(self) -> Sequence[Transaction]:
         """Return the reads of the next cycle."""
         raise NotImplementedError
@@ -176,8 +173,8 @@ sync = pytest.mark.parametrize("line", ["sync read"], indirect=True)
 fast_sync = pytest.mark.parametrize("line", ["fast sync read"], indirect=True)
 
 
-class GoodReplies:
-    """Whatever the pieces in which good replies come, they are taken."""
+class SpoiltReplies:
+    """Good replies are taken, whatever their pieces; what is not quite one is not, and is never lost."""
 
     host: ClassVar[type[Host]]
 
@@ -185,8 +182,7 @@ class GoodReplies:
     def line(self, request: pytest.FixtureRequest):
         host = self.host(request.param)
         host.calm()
-        yield host
-        host.close()
+        return host
 
     @every
     def test_data_may_be_anything_that_is_no_jump(self, line):
@@ -211,10 +207,6 @@ class GoodReplies:
             assert line.cycle(replies, pieces, by_kernel=bounded) == GOOD
             assert line.heard() == line.given
             line.calm()
-
-
-class SpoiltReplies(GoodReplies):
-    """What is not quite a reply is not taken, and never lost; on virtual time."""
 
     @plain
     @pytest.mark.parametrize("victim", [0, 1, 3])

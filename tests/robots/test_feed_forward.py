@@ -3,18 +3,14 @@
 `bench/feed_forward.py` prints the table of the docs; here are its bounds.
 """
 
-import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from msgspec.structs import replace
-from tests.kit.campaigns import campaign
-from tests.kit.clients import Ask, steered
 
 from bench import feed_forward as bench
-from dxlrun.description.joints.motor_file import motor_text
 from dxlrun.testing import read_log, simulated_robot
 from dxlrun_analysis.replay import replay_log
 
@@ -88,41 +84,3 @@ def test_a_pid_controller_below_has_ten_times_less_to_do(tmp_path, interface):
     found, log = bench.tracked(tmp_path, text[1], bench.XM430, seconds=SECONDS)
     assert found.rms < without.rms / 10
     assert np.isfinite(log.cycles[f"goal_{interface}"][100:]).all()
-
-
-STORM = """\
-name: storm
-buses: {main: {port: sim, protocol: 1.0, baud_rate: 1_000_000, return_delay_time: 0 us}}
-loop: {rate: 200}
-joints:
-  joint: {bus: main, id: 1, model: MX-64, reference: 180 deg, direction: 1, motor: known.yaml,
-          limits: {position: [-60 deg, 60 deg], velocity: 3 rad/s, acceleration: 40 rad/s^2}}
-controllers:
-  ff: {type: feed_forward, joints: [joint]}
-  group: {type: joint_group_posvel_controller, joints: [joint], into: ff}
-"""
-
-
-@campaign(ci=1, night=8, release=80)
-def test_the_gate_keeps_the_limits_whatever_is_added(tmp_path, number, chance):
-    (tmp_path / "known.yaml").write_text(motor_text(bench.MX64, {}))
-    (tmp_path / "storm.yaml").write_text(STORM)
-    limit = math.radians(60)
-    asks = [
-        Ask(
-            0.5 + 0.03 * k,
-            "group",
-            "posvel",
-            {"positions": [chance.uniform(-limit, limit)], "velocities": [chance.uniform(0.0, 3.0)]},
-        )
-        for k in range(100)
-    ]
-    cycles = steered(tmp_path, tmp_path / "storm.yaml", 4.0, asks).log.cycles
-    goals, commands = cycles["goal_position"][:, 0], cycles["command_position"][:, 0]
-    speeds = np.diff(goals) * 200
-    assert np.abs(goals).max() <= limit + 1e-9
-    assert np.abs(speeds).max() <= 3.0 + 1e-6
-    assert np.abs(np.diff(speeds)).max() * 200 <= 40.0 + 1e-3
-    # the gate had something to do: the commands alone are far faster
-    assert np.abs(np.diff(commands[100:])).max() * 200 > 30.0
-    assert np.ptp(cycles["position"]) > 0.5
