@@ -112,6 +112,3 @@ def test_controllers_are_held_until_no_policy_holds_them() -> None:
     for holder, rows in ((first, {0}), (second, {0, 1}), (first, set()), (second, set())):
         actions.hold_controllers(holder, rows, "are cool")  # two monitors may have the same sentence
     assert [rows for rows, _ in noted.held] == [{0}, {0, 1}, {0, 1}, set()]
-    for policy, why in (("on_fault", "it is enough"), ("on_exit", "only the first reason counts")):
-        actions.end_run(policy, why)
-    assert actions.ending == ("on_fault", "it is enough; on_fault: limp")
