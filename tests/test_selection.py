@@ -72,7 +72,9 @@ def test_each_worker_begins_with_slow_files_and_ends_with_short_tests() -> None:
 
 def test_what_passed_is_left_out_of_the_next_run(tmp_path: Path) -> None:
     torn = "def teardown_module():\n    assert False\ndef test_torn():\n    pass\n"
-    files = FILES | {"test_torn.py": torn, "test_wrong.py": "def test_wrong():\n    assert False\n"}
+    less = f"def test_less(record_property):\n    record_property({selection.CHECKED_LESS!r}, 'all')\n"
+    wrong = "def test_wrong():\n    assert False\n"
+    files = FILES | {"test_torn.py": torn, "test_wrong.py": wrong, "test_less.py": less}
     for words, left_out in (
         ((), "long tests that no given change needs (--all"),
         (("--all",), "tests that have"),

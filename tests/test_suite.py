@@ -46,6 +46,17 @@ def test_limit_grows_with_the_load(pytestconfig: pytest.Config, monkeypatch: pyt
     assert given == [120.0, 1440.0]
 
 
+@pytest.mark.skipif(not (ROOT / ".ci").exists(), reason="an sdist has no .ci")
+def test_no_job_of_ci_outlives_it(tmp_path: Path) -> None:
+    _, jobs, rest = (ROOT / ".ci/run").read_text().partition("declare -A job")
+    head = jobs + rest[: rest.index("trap 'exit 143'")]
+    slow = """slow() { bash -c 'echo $$ > pid; exec sleep 1000'; }
+        start slow; until [ -s pid ]; do sleep 0.01; done; false"""
+    command = ["/bin/bash", "-c", f"set -euo pipefail; work=$PWD/work\n{head}\n{slow}"]
+    assert subprocess.run(command, cwd=tmp_path, check=False).returncode == 1
+    assert not Path("/proc", (tmp_path / "pid").read_text().strip()).exists()
+
+
 CLOCKS = {"monotonic", "monotonic_ns", "perf_counter", "time", "time_ns"}
 DURATIONS = {
     "tests/kit/awaited.py": "the deadline",

@@ -58,6 +58,9 @@ TESTED = {
 }
 """Rooms that a folder of tests is about; `dxlrun.features` is each feature."""
 
+CHECKED_LESS = "checked less"
+"""Property (`record_property`) of a test that checks more with some extra: `--passed` does not omit it."""
+
 
 def room_of(module: str) -> str:
     """Return the room of a module: `dxlwire`, `dxlrun.control`, `dxlrun.features.sensors`, `dxlrun_lab`."""
@@ -210,10 +213,10 @@ class Selection:
             self._left_out["passed" if passed else "long" if long else "campaign" if campaign else ""] += 1
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        """Note a test that passes, until its teardown fails."""
+        """Note a test that passes and has checked all, until its teardown fails."""
         if report.failed:
             self._passing.discard(report.nodeid)
-        elif report.when == "call" and report.passed:
+        elif report.when == "call" and report.passed and CHECKED_LESS not in dict(report.user_properties):
             self._passing.add(report.nodeid)
 
     @pytest.hookimpl(optionalhook=True)

@@ -27,6 +27,7 @@ import numpy as np
 import pytest
 from tests.kit.laws import CONTROLLERS, Case, cases, chain_of
 from tests.kit.line_faults import turn_by_hand
+from tests.kit.selection import CHECKED_LESS
 from tests.kit.stories import replayed
 
 from dxlrun.channels.answers import Refusal
@@ -80,6 +81,9 @@ class Steered:
         return "velocity" if "position" in self.interfaces else "position"
 
 
+HAS_GRAVITY = find_spec("mujoco") is not None
+
+
 @cache
 def steered(each: int = 1) -> tuple[Steered, ...]:
     """Return every standard controller that claims a joint and is installed, in each of its ways to command.
@@ -88,7 +92,7 @@ def steered(each: int = 1) -> tuple[Steered, ...]:
     """
     found = []
     for index, case in enumerate(cases(("x", "y"))):
-        if case.type in WITHOUT_JOINTS or (case.type == "gravity_compensation" and not find_spec("mujoco")):
+        if case.type in WITHOUT_JOINTS or (case.type == "gravity_compensation" and not HAS_GRAVITY):
             continue
         count = 2 if case.type == "diff_drive_controller" else each
         names = (f"j{index}", f"k{index}")[:count]
@@ -531,7 +535,9 @@ def pairs() -> Iterator[tuple[str, str]]:
 
 
 @pytest.mark.parametrize(("name", "kind"), [*pairs()])
-def test_no_joint_moves_until_a_client_commands_it(tmp_path, name, kind):
+def test_no_joint_moves_until_a_client_commands_it(tmp_path, record_property, name, kind):
+    if not HAS_GRAVITY:
+        record_property(CHECKED_LESS, "gravity_compensation needs dxlrun[physics]")
     happens, _, policy = WAYS[name]
     story = Story(tmp_path, kind, policy)
     if name != "start":
