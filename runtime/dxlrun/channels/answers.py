@@ -71,7 +71,7 @@ class Code(StrEnum):
         "too_many_controllers",
         "the run has {most} controllers, the maximum; unload one first",
     )
-    NOT_IN_PAUSE = "not_in_pause", "the loop is not paused; pause it first"
+    NOT_IN_PAUSE = "not_in_pause", "the loop is not paused; pause it by `dxlrun pause`"
     # goals and parameters
     UNKNOWN_TOPIC = "unknown_topic", "there is no topic {topic}; there are {topics}"
     UNKNOWN_GOAL = "unknown_goal", "there is no goal {goal}; the newest is {last}"
@@ -97,7 +97,8 @@ class Code(StrEnum):
     )
     RATE_NOT_DIVIDED = (
         "rate_not_divided",
-        "{rate:g} Hz is not a multiple of {controller_rate:g} Hz, the rate of controller {controller}",
+        "{rate:g} Hz is not a multiple of {controller_rate:g} Hz, the rate of controller {controller}; "
+        "choose another rate",
     )
     RATE_BELOW_UPPER = (
         "rate_below_upper",

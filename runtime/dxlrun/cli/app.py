@@ -241,12 +241,13 @@ def _right_form(error: CycloptsError, tokens: Sequence[str]) -> str:
         return _without_options(error, verb, given)
     if {"=", ":="} & set(given) and verb:
         return shlex.join(("dxlrun", *verb, *(word for word in given if word not in ("=", ":="))))
-    if verb == ["switch"] and isinstance(error, UnusedCliTokensError):
-        return shlex.join(("dxlrun", *verb, "--activate", *given))
+    if isinstance(error, UnusedCliTokensError) and verb in (["switch"], ["rate"]):
+        words = ["--activate", *given] if verb == ["switch"] else ["".join(given)]
+        return shlex.join(("dxlrun", *verb, *words))
     place = error.argument
     if isinstance(error, MissingArgumentError) and verb and place and place.field_info.is_positional:
         # `set base gain=400`, `set base.gain 400`: two words were joined to one.
-        for sign in (":=", "=", "."):
+        for sign in (".",) if verb == ["send"] else (":=", "=", "."):
             words = [part for word in given for part in _parts(word, sign)]
             if len(words) == len(given) + 1 and all(words):
                 return shlex.join(("dxlrun", *verb, *words))

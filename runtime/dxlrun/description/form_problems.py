@@ -240,6 +240,8 @@ def data_problems(error: ValidationError, what: str, model: type[BaseModel], mos
     for details in error.errors(include_url=False)[:most]:
         # the step names a member of a union
         location = [part for part in details["loc"] if not str(part).startswith("<")]
+        if details["type"] == "missing":
+            location.pop()
         places |= {(what, *location[:end]): Mark(what) for end in range(len(location) + 1)}
     return problems_of(error, Marks(what, places, places), (what,), model=model, most=most)
 

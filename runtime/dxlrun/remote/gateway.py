@@ -507,6 +507,9 @@ class GatewayApp:
                 source, content, self._plans(), self._active, self._preparation.takes
             )
             loaded = self._link.controllers[name]
+        elif asked.part() not in self._link.controllers and kind in self._link.controllers:
+            hint = texts.wrong_order(kind, asked.part())
+            raise refused(Code.UNKNOWN_CONTROLLER, {"controller": asked.part()[:80], "hint": hint})
         else:
             loaded = self._known(asked)
         units = query.get("units") == "true" and source is None
@@ -563,7 +566,7 @@ class GatewayApp:
         """Activate and deactivate controllers in one cycle; reply after servos have changed their modes."""
         switch, known = asked.body, tuple(self._link.controllers)
         if unknown := [name for name in (*switch.activate, *switch.deactivate) if name not in known]:
-            raise unknown_controllers(unknown, known)
+            raise unknown_controllers(unknown, known, self._plans())
         # Checked here, because the loop must not iterate over thousands of names.
         for names in (switch.activate, switch.deactivate):
             if twice := tuple(name for name, count in Counter(names).items() if count > 1):
@@ -737,7 +740,7 @@ class GatewayApp:
         name = asked.part()
         loaded = self._link.controllers.get(name)
         if loaded is None:
-            raise unknown_controllers([name], (*self._link.controllers, *self._commanded))
+            raise unknown_controllers([name], (*self._link.controllers, *self._commanded), self._plans())
         return loaded
 
 

@@ -67,8 +67,13 @@ _LONGEST_SENTENCE = 300
 _MOST_QUANTITIES = 20
 """Upper limit of the wrong quantities that a refusal lists."""
 _NAME: TypeAdapter[str] = TypeAdapter(Name)
-_GROUP_FIELDS = frozenset({"positions", "velocities", "efforts", "pwm"})
-"""Fields of the commands of group controllers (positions, velocities, efforts or PWM)."""
+GROUP_FIELDS: Mapping[str, str] = {
+    "position": "positions",
+    "velocity": "velocities",
+    "effort": "efforts",
+    "pwm": "pwm",
+}
+"""Interface -> field of the commands of group controllers, which has a value for each joint."""
 
 
 class RefusedRequest(Exception):
@@ -300,7 +305,8 @@ class Preparation:
         if model is None:
             kinds = tuple(controller.Commands)
             fields: dict[str, Field] = {"controller": plan.name, "kind": kind, "known": kinds}
-            raise refused(Code.UNKNOWN_COMMAND, fields | {"hint": suggestion(kind, kinds)})
+            hint = suggestion(kind, (*kinds, *joint_quantities(controller.Commands)))
+            raise refused(Code.UNKNOWN_COMMAND, fields | {"hint": hint})
         what = f"{kind} of {plan.name}"
         if units and _of_motions(kind, model):
             body = in_si(body, what, known.joints)
@@ -465,10 +471,17 @@ _QUANTITIES: Mapping[JointUnit, Mapping[str, Callable[[object], object]]] = {
 """Unit of a joint -> command field -> function that converts a quantity with its unit into SI."""
 
 
+def joint_quantities(commands: Mapping[str, type[BaseModel]]) -> list[str]:
+    """Return the interfaces for which a controller with these commands accepts values by joint."""
+    given = {field for model in commands.values() for field in model.model_fields}
+    given |= {"positions"} if TRAJECTORY in commands else set()
+    return [name for name, field in GROUP_FIELDS.items() if field in given]
+
+
 def _of_motions(kind: str, model: type[BaseModel]) -> bool:
     """Return whether quantities of a command may be texts with units: a trajectory, or a group's command."""
     fields = set(model.model_fields)
-    return kind == TRAJECTORY or (bool(fields) and fields <= _GROUP_FIELDS)
+    return kind == TRAJECTORY or (bool(fields) and fields <= set(GROUP_FIELDS.values()))
 
 
 def in_si(body: bytes, what: str, joints: Sequence[JointPlan] = ()) -> bytes:
@@ -572,10 +585,13 @@ def _refuse_entry(found: Sequence[Mistake]) -> RefusedRequest:
     return invalid("; ".join(_one_line(f"{one.what}; {one.fix}") for one in found[:_MOST_MISTAKES]))
 
 
-def unknown_controllers(names: Sequence[str], known: Sequence[str]) -> RefusedRequest:
-    """Return the refusal for unknown controllers, with similar names as hints."""
+def unknown_controllers(
+    names: Sequence[str], known: Sequence[str], plans: Sequence[ControllerPlan] = ()
+) -> RefusedRequest:
+    """Return the refusal for unknown controllers; hints are similar names, or those that move the joint."""
     shown = tuple(name[:80] for name in names[:_MOST_MISTAKES])
-    hints = [suggestion(name, known) for name in shown]
+    moving = {name: [plan.name for plan in plans if plan.command and name in plan.joints] for name in shown}
+    hints = [texts.moved_by(moving[name]) if moving[name] else suggestion(name, known) for name in shown]
     if len(shown) > 1:
         hints = [f"{name}: {hint}" for name, hint in zip(shown, hints, strict=True)]
     return refused(Code.UNKNOWN_CONTROLLER, {"controller": shown, "hint": "; ".join(hints)})

@@ -94,6 +94,18 @@ def no_joint_named(controller: str, kind: str, joint: str) -> str:
     return f"{kind} of {controller} names no joint; write for example {joint}=20deg"
 
 
+def not_moved(controller: str, joint: str, joints: Collection[str]) -> str:
+    return f"{controller} does not move {joint}; it moves {', '.join(joints)}"
+
+
+def moved_by(controllers: Collection[str]) -> str:
+    return f"this is a joint; name a controller that moves it: {', '.join(controllers)}"
+
+
+def wrong_order(controller: str, kind: str) -> str:
+    return f"write the controller first: {controller} {kind}"
+
+
 def takes_no_time(controller: str) -> str:
     return f"{controller} moves its joints immediately; omit the time"
 

@@ -67,7 +67,8 @@ def test_what_the_run_refuses_returns_to_the_procedure(single, arm):
     rates = (160, 200)
     plays, done = perform(arm, "elbow", lambda joint: (sine(joint, loop_rate=rate) for rate in rates))
     assert plays.refused == [
-        "160 Hz is not a multiple of 50 Hz, the rate of controller joint_state_broadcaster"
+        "160 Hz is not a multiple of 50 Hz, the rate of controller joint_state_broadcaster; "
+        "choose another rate"
     ]
     assert (done.why, len(plays.got)) == ("", 1)
 

@@ -63,13 +63,19 @@ def send(
         With --no-wait, return as soon as the controller has accepted the command.
     """
     from dxlrun.channels.answers import Code
-    from dxlrun.cli.steering.written import WrittenEntry
+    from dxlrun.cli.steering.written import WrittenEntry, is_apart
     from dxlrun.description.source_names import SOURCE_COMMANDS
     from dxlrun.description.units import duration
 
+    if "=" in controller:
+        raise InputError(
+            f"{controller} has no controller; write `dxlrun send CONTROLLER position {controller}`"
+        )
     for_device = "=" in kind
     if for_device:
         words, kind = (kind, *words), SOURCE_COMMANDS
+    if in_ and (unit := next((word for word in words if word[-1:] in "sn" and is_apart(in_, word)), "")):
+        raise InputError(f"{unit!r} is not key=value; write --in {in_}{unit} without the space")
     try:
         seconds = None if in_ is None else duration(in_, bare="s") * 1e-9
     except ValueError as error:

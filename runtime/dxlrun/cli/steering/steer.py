@@ -239,7 +239,7 @@ def load_controller(
     """
     from dxlrun.cli.steering.written import WrittenEntry
 
-    entry = WrittenEntry.from_words(words, file).data
+    entry = WrittenEntry.from_words(words, file, example="type=joint_group_position_controller").data
     if "type" not in entry:
         raise InputError(f"{name} has no type; give one, such as type=joint_group_position_controller")
     with connect_robot(chosen.robot, "load") as robot:

@@ -17,6 +17,7 @@ from dxlrun.description.document import PlainDocument, grow, literal, parse, rea
 from dxlrun.errors import DxlrunError, InputError, Problem, Refused
 
 _WORDS = "command line"
+_EXAMPLE = "elbow=20deg, or 'positions=[30 deg, 0 deg]'"
 _NEXT_KEY = re.compile(r"\s+(?=[^\W\d][\w.]*=)")
 """Space before the next pair of a word with several, such as "x=20cm y=0cm"."""
 _UNIT = re.compile(r"[A-Za-z°µ]{1,4}(?:/s(?:\^2)?)?|%")
@@ -33,11 +34,19 @@ class WrittenEntry:
     """First word, if it is a name without its key."""
 
     @classmethod
-    def from_words(cls, words: Sequence[str], file: Path | None, *, named: bool = False) -> WrittenEntry:
+    def from_words(
+        cls, words: Sequence[str], file: Path | None, *, named: bool = False, example: str = _EXAMPLE
+    ) -> WrittenEntry:
         """Read `key=value` words, each with one pair or several, or a file.
 
-        With `named`, the first word may begin with a name without its key. Raises InputError if words and
-        file are given, and for invalid YAML.
+        Args:
+            words: The words.
+            file: The file.
+            named: The first word may begin with a name without its key.
+            example: A pair, for a word that is none.
+
+        Raises:
+            InputError: Words and a file are given, a word is not a pair, or the YAML is invalid.
         """
         if file is not None and words:
             raise InputError(f"{words[0]!r} and --file exclude each other; give the words, or the file")
@@ -45,13 +54,17 @@ class WrittenEntry:
         if file is not None:
             text, name = read_text(file), str(file)
         else:
+            spaced = next((word for word in words if word[:1] == "=" or word[-1:] == "="), "")
+            if spaced:
+                pair = re.sub(r"\s*=\s*", "=", " ".join(words))
+                raise InputError(f"{spaced!r} is not key=value; write {pair} without spaces at =")
             for word, unit in pairwise(words):
-                if word[-1:].isdigit() and "=" in word and _UNIT.fullmatch(unit):
+                if "=" in word and is_apart(word, unit):
                     raise InputError(f"{unit!r} is not key=value; write {word}{unit} without the space")
             pairs = [pair for word in words for pair in _NEXT_KEY.split(word)]
             if named and pairs and "=" not in pairs[0]:
                 first = pairs.pop(0)
-            text, name = "\n".join(map(_line, pairs)) or "{}", _WORDS
+            text, name = "\n".join(_line(pair, example) for pair in pairs) or "{}", _WORDS
         try:
             written = cls(grow(parse(text, name), name, literal), in_words=file is None, name=first)
         except InputError as error:
@@ -102,8 +115,13 @@ class WrittenEntry:
         return InputError(found)
 
 
-def _line(word: str) -> str:
-    key, value = parse_pair(word, "elbow=20deg, or 'positions=[30 deg, 0 deg]'")
+def is_apart(number: str, unit: str) -> bool:
+    """Return True if a number and its unit were written as two words."""
+    return number[-1:].isdigit() and _UNIT.fullmatch(unit) is not None
+
+
+def _line(word: str, example: str = _EXAMPLE) -> str:
+    key, value = parse_pair(word, example)
     if "\n" in value:
         raise InputError(f"the value of {key} has a line break; write it on one line, or give a --file")
     return f"{key}: {value}"

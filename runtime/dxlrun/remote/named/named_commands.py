@@ -23,15 +23,22 @@ from dxlrun.description.source_names import SOURCE_COMMANDS
 from dxlrun.errors import suggestion
 from dxlrun.plan.loop_plan import ControllerPlan, JointPlan, SourcePlan
 from dxlrun.remote import texts
-from dxlrun.remote.preparation import ResolvedController, invalid, plain_quantities, refused, travel_s
+from dxlrun.remote.preparation import (
+    GROUP_FIELDS,
+    ResolvedController,
+    invalid,
+    joint_quantities,
+    plain_quantities,
+    refused,
+    travel_s,
+)
 
 POINT_SPEED = 0.5
 """Speed of a move of named joints without a duration, rad/s or m/s; slower joints use their highest speed."""
 DURATION = "seconds"
 """Field of a command of any controller that has the duration of its motion, s."""
 _SHORTEST_S = 0.1
-_FIELDS = {"position": "positions", "velocity": "velocities", "effort": "efforts", "pwm": "pwm"}
-INTERFACES = {**{name: name for name in _FIELDS}, **{field: name for name, field in _FIELDS.items()}}
+INTERFACES = {**{name: name for name in GROUP_FIELDS}, **{each: name for name, each in GROUP_FIELDS.items()}}
 """Interface as a client writes it, singular or plural -> interface: `positions` -> `position`."""
 
 
@@ -85,14 +92,16 @@ def joint_command(
     if kind in commands and (strangers or not named):
         return None
     # Fields of a command: refused later, with the command's name.
-    if strangers and set(named) <= set(_FIELDS.values()):
+    if strangers and set(named) <= set(GROUP_FIELDS.values()):
         return None
     if not named:
         raise invalid(texts.no_joint_named(plan.name, kind, plan.joints[0]))
     if strangers:
+        if strangers[0] in record.layout.joints:
+            raise invalid(texts.not_moved(plan.name, strangers[0], plan.joints))
         fields: dict[str, Field] = {"joint": strangers[0][:80], "controller": plan.name}
         raise refused(Code.UNKNOWN_JOINT, fields | {"hint": suggestion(strangers[0][:80], plan.joints)})
-    field = _FIELDS[interface]
+    field = GROUP_FIELDS[interface]
     values = _numbers(known, kind, field, named, units)
     chosen, fields_of = _command_for(known, interface)
     if fields_of is None:
@@ -148,11 +157,11 @@ def _command_for(known: ResolvedController, interface: str) -> tuple[str, tuple[
 
     Raises RefusedRequest when the controller has no such command.
     """
-    field, commands = _FIELDS[interface], known.controller.Commands
+    field, commands = GROUP_FIELDS[interface], known.controller.Commands
     found: dict[str, tuple[str, ...]] = {}
     for kind, model in commands.items():
         fields = tuple(model.model_fields)
-        if field in fields and set(fields) <= set(_FIELDS.values()):
+        if field in fields and set(fields) <= set(GROUP_FIELDS.values()):
             found[kind] = fields
     # Choose the command with the fewest fields, because the other fields need default values.
     if found:
@@ -160,12 +169,7 @@ def _command_for(known: ResolvedController, interface: str) -> tuple[str, tuple[
         return kind, found[kind]
     if interface == "position" and TRAJECTORY in commands:
         return TRAJECTORY, None
-    offered = [
-        name
-        for name, each in _FIELDS.items()
-        if any(each in model.model_fields for model in commands.values())
-        or (name == "position" and TRAJECTORY in commands)
-    ]
+    offered = joint_quantities(commands)
     name = known.plan.name
     hint = texts.quantities_of_joints(name, offered) if offered else suggestion(interface, commands)
     fields_of: dict[str, Field] = {"controller": known.plan.name, "kind": interface, "known": tuple(commands)}
