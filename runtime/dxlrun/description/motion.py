@@ -30,7 +30,19 @@ Expression = Annotated[
 """Formula of the time t in s since the start of the part, as text; `compile` evaluates it."""
 
 
-class Target(Form):
+class JointForm(Form):
+    """Form of a joint's motion, with its position among other keys."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _has_keys(cls, value: object) -> object:
+        # The values of a pose are written like that.
+        if isinstance(value, str | int | float):
+            raise validation_error("the position has no key", f"write {{position: {value}}}")
+        return value
+
+
+class Target(JointForm):
     """Form of a joint's goal at one point: position, velocity and acceleration, one of which is required."""
 
     position: Position | None = key(
@@ -81,7 +93,7 @@ class Point(Form):
         return self
 
 
-class Formula(Form):
+class Formula(JointForm):
     """Form of one joint's motion as formulas of t, s."""
 
     position: Expression = key(
