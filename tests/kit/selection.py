@@ -147,8 +147,9 @@ def deal(items: Sequence[pytest.Item], workers: int) -> list[pytest.Item]:
         if item.path in slow:
             folders.setdefault(item.path.parent, []).append(item)
     stretches: list[list[pytest.Item]] = [[] for _ in range(workers)]
+    # A file is a better measure of time than a test: some have hundreds of short ones.
     for tests in folders.values():
-        min(stretches, key=len).extend(tests)
+        min(stretches, key=lambda stretch: len({item.path for item in stretch})).extend(tests)
     short = (item for item in items if item.path not in slow)
     left = len(items)
     for number, stretch in enumerate(stretches):
