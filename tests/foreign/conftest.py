@@ -33,13 +33,6 @@ class Simulation(BusProcess):
         """
         self._hasty.add(bus)
 
-    def fault(self, line: str) -> None:
-        """Break something on the running simulation; return when it took the order."""
-        said = self.ask(fault=line)
-        while "fault" not in said:
-            assert "happened" in said, said
-            said = self.next()
-
     def judge(self) -> None:
         """End it, and find in the ledger what was expected and no accident."""
         notes = [(entry.bus, entry.note) for entry in self.hang_up() if entry.direction == "note"]

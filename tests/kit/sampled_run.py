@@ -9,7 +9,7 @@ from msgspec.structs import replace
 from tests.kit.stories import Clients, replayed
 from tests.kit.wire import values_written
 
-from dxlrun.channels.answers import Answer, Completion
+from dxlrun.channels.answers import Answer
 from dxlrun.channels.commands import CommandMessage
 from dxlrun.channels.cycle import Floats
 from dxlrun.log.log_reader import Log, read_log
@@ -74,11 +74,6 @@ class SampledRun:
 
     def answer(self, number: int) -> Answer:
         return self._clients.answers[number]
-
-    def is_done(self, *numbers: int) -> bool:
-        """Return True where these commands, by default all, were answered as done."""
-        wanted = numbers or range(1, self._asked + 1)
-        return all(isinstance(self._clients.answers.get(one), Completion) for one in wanted)
 
     def shaft(self, joint: str, from_ms: float = 0.0, to_ms: float = math.inf) -> Floats:
         """Return the angles of a joint's servo in a time; one each period."""
