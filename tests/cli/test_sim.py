@@ -3,23 +3,21 @@
 import contextlib
 import json
 import os
-import pty
 import re
 import resource
 import select
 import signal
-import struct
 import subprocess
 import sys
 import termios
 from collections.abc import Callable, Iterator
-from fcntl import ioctl
 from pathlib import Path
 from typing import Any
 
 import pytest
 from tests.kit.answers import read_answer, result_of
 from tests.kit.awaited import DEADLINE_S, until
+from tests.kit.hands import Screen, plain
 from tests.kit.pages import page_blocks, page_text
 
 from dxlsim.bus.ledger import read_ledger
@@ -27,8 +25,6 @@ from dxlsim.bus.ledger import read_ledger
 pytestmark = pytest.mark.long
 
 PROGRAM = [sys.executable, "-P", "-m", "dxlrun"]
-OWN_TERMINAL = "import fcntl, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0); from dxlrun.cli import main; "
-"""As a shell does it, so that Ctrl-C is a signal."""
 PING_1 = bytes.fromhex("ff ff fd 00 01 03 00 01 19 4e")
 PONG_1 = bytes.fromhex("ff ff fd 00 01 07 00 55 00 24 04 2d")
 """A ping of servo 1 (e-Manual, Protocol 2.0, Ping), and the first bytes of the answer of an XL430-W250."""
@@ -250,52 +246,22 @@ def test_front_that_is_killed_leaves_no_link(start: Start, tmp_path: Path) -> No
     assert not os.path.lexists(tmp_path / "robot")
 
 
-@contextlib.contextmanager
-def on_terminal(tmp_path: Path, *words: str) -> Iterator[tuple[subprocess.Popen[bytes], int]]:
-    ours, theirs = pty.openpty()
-    ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 120, 0, 0))
-    environment = {name: value for name, value in os.environ.items() if name not in ("COLUMNS", "LINES")}
-    process = subprocess.Popen(
-        [sys.executable, "-P", "-c", f"{OWN_TERMINAL}raise SystemExit(main())", "sim", *words],
-        stdin=theirs,
-        stdout=theirs,
-        stderr=theirs,
-        env=environment | {"TERM": "xterm"},
-        cwd=tmp_path,
-        start_new_session=True,
-    )
-    try:
-        yield process, ours
-    finally:
-        process.kill()
-        process.wait()
-        os.close(theirs)
-        os.close(ours)
-
-
 def test_on_a_terminal_a_table_lives_and_letters_are_shown(tmp_path: Path) -> None:
-    with on_terminal(tmp_path, "--servo", "XL430-W250:1-2") as (process, terminal):
-        shown = ""
-
-        def until(pattern: str) -> None:
-            nonlocal shown
-            while not re.search(pattern, shown):
-                assert select.select([terminal], [], [], DEADLINE_S)[0], shown
-                shown += re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", os.read(terminal, 65536).decode())
-
-        until(r"2 +XL430-W250 +limp +\S+ +180\.0")
-        mode = termios.tcgetattr(terminal)
+    words = ("sim", "--servo", "XL430-W250:1-2")
+    with Screen(tmp_path, *words, columns=120, TERM="xterm") as screen:
+        screen.matches(r"2 +XL430-W250 +limp +\S+ +180\.0")
+        mode = termios.tcgetattr(screen.terminal)
         mode[3] |= termios.ECHO  # as a shell may leave it after Ctrl-Z and fg
-        termios.tcsetattr(terminal, termios.TCSANOW, mode)
-        process.send_signal(signal.SIGCONT)
-        while termios.tcgetattr(terminal)[3] & termios.ECHO:
-            until(rf"(?s).{{{len(shown)}}}.*asked")
-        os.write(terminal, b"overlaod\x7f\x7f\x7foad servo=2")
-        until("fault> overload servo=2")
-        os.write(terminal, b"\n")
-        until("\nfault: overload servo=2|\rfault: overload servo=2")
-        until(r"2 +XL430-W250 .* 0x20")
-        os.write(terminal, b"\x03")  # Ctrl-C is a signal here as everywhere
-        until("simulation: ended after")
-        assert process.wait(DEADLINE_S) == 0
-        assert termios.tcgetattr(terminal)[3] & termios.ECHO  # as it was before
+        termios.tcsetattr(screen.terminal, termios.TCSANOW, mode)
+        screen.process.send_signal(signal.SIGCONT)
+        while termios.tcgetattr(screen.terminal)[3] & termios.ECHO:
+            screen.matches(rf"(?s).{{{len(plain(screen.shown))}}}.*asked")
+        screen.types("overlaod\x7f\x7f\x7foad servo=2")
+        screen.matches("fault> overload servo=2")
+        screen.types("\n")
+        screen.matches("\nfault: overload servo=2|\rfault: overload servo=2")
+        screen.matches(r"2 +XL430-W250 .* 0x20")
+        screen.types("\x03")  # Ctrl-C is a signal here as everywhere
+        screen.matches("simulation: ended after")
+        assert screen.ended() == 0
+        assert termios.tcgetattr(screen.terminal)[3] & termios.ECHO  # as it was before

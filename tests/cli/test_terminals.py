@@ -1,16 +1,11 @@
 """Narrow terminals, closed streams, full disks behind them, readers that leave: all of it in processes."""
 
-import os
-import pty
-import re
-import struct
 import subprocess
 import sys
-import termios
-from fcntl import ioctl
 from pathlib import Path
 
 import pytest
+from tests.kit.hands import Screen, plain
 
 pytestmark = pytest.mark.long
 
@@ -20,22 +15,9 @@ ALL = ">&- 2>&- <&-"
 
 def on_terminal(columns: int, *words: str) -> str:
     """Return what a terminal of that width gets to show."""
-    ours, theirs = pty.openpty()
-    ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, columns, 0, 0))
-    environment = {name: value for name, value in os.environ.items() if name not in ("COLUMNS", "LINES")}
-    environment |= {"TERM": "xterm", "NO_COLOR": "1"}
-    command = [*PROGRAM, *words]
-    process = subprocess.Popen(command, stdin=theirs, stdout=theirs, stderr=theirs, env=environment)
-    os.close(theirs)
-    shown = b""
-    while True:
-        try:
-            shown += os.read(ours, 65536)
-        except OSError:  # how Linux reports that the terminal has no writer any more
-            break
-    os.close(ours)
-    assert process.wait() == 0
-    return re.sub(r"\x1b\[[0-9;]*m", "", shown.decode())
+    with Screen(Path.cwd(), *words, columns=columns, TERM="xterm", NO_COLOR="1") as screen:
+        assert screen.ended() == 0
+        return plain(screen.shown)
 
 
 @pytest.mark.parametrize("columns", [20, 40, 160])

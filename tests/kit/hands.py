@@ -1,6 +1,7 @@
 """Hands: scripts that answer dialogues, and simulated servos that they connect and turn."""
 
 import os
+import re
 import select
 import subprocess
 import sys
@@ -174,18 +175,29 @@ class LiveRobot:
         awaited.until(done, said, check=live)
 
 
+def plain(shown: str) -> str:
+    """Return what a terminal showed without its escape sequences."""
+    return re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", shown)
+
+
 class Screen:
     """A command at a terminal; a context manager, which ends it."""
 
-    def __init__(self, directory: Path, *words: str) -> None:
-        self._master, slave = os.openpty()
+    def __init__(self, directory: Path, *words: str, columns: int = 80, **variables: str) -> None:
+        self.terminal, slave = os.openpty()
+        termios.tcsetwinsize(slave, (24, columns))
         command = [sys.executable, "-P", "-c", CODE, *words]
+        environment = {name: value for name, value in os.environ.items() if name not in ("COLUMNS", "LINES")}
         streams = dict.fromkeys(("stdin", "stdout", "stderr"), slave)
         # a session of its own, with this terminal: so Ctrl-C reaches it
         take = "import fcntl, os, sys, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0); "
         take += "os.execv(sys.argv[1], sys.argv[1:])"
-        self._process = subprocess.Popen(
-            [sys.executable, "-c", take, *command], cwd=directory, start_new_session=True, **streams
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", take, *command],
+            cwd=directory,
+            env=environment | variables,
+            start_new_session=True,
+            **streams,
         )
         os.close(slave)
         self.text = self.shown = ""
@@ -195,9 +207,9 @@ class Screen:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._process.kill()
-        self._process.wait()
-        os.close(self._master)
+        self.process.kill()
+        self.process.wait()
+        os.close(self.terminal)
 
     def sees(self, words: str) -> None:
         """Wait until the terminal shows words behind those that were waited for before."""
@@ -210,29 +222,34 @@ class Screen:
         assert words in self.text, self.text
         self.text = self.text.partition(words)[2]
 
+    def matches(self, pattern: str) -> None:
+        """Wait until all that was shown, without colours and moves of the cursor, has a pattern."""
+        while not re.search(pattern, plain(self.shown)):
+            assert self._read(), self.shown
+
     def types(self, text: str) -> None:
-        os.write(self._master, text.encode())
+        os.write(self.terminal, text.encode())
 
     def kill(self) -> None:
         """End it as no program can prevent."""
-        self._process.kill()
+        self.process.kill()
 
     def echoes(self) -> bool:
         """Return whether the terminal shows what is typed, line by line, as it did before."""
-        modes = termios.tcgetattr(self._master)[3]
+        modes = termios.tcgetattr(self.terminal)[3]
         return modes & (termios.ECHO | termios.ICANON) == termios.ECHO | termios.ICANON
 
     def ended(self) -> int:
         """Return the exit code; `text` has all that was shown until then."""
         while self._read():
             pass
-        return self._process.wait(awaited.DEADLINE_S)
+        return self.process.wait(awaited.DEADLINE_S)
 
     def _read(self) -> bool:
-        if not select.select([self._master], [], [], awaited.DEADLINE_S)[0]:
+        if not select.select([self.terminal], [], [], awaited.DEADLINE_S)[0]:
             return False
         try:
-            data = os.read(self._master, 4096)
+            data = os.read(self.terminal, 4096)
         except OSError:  # its other end is closed
             return False
         text = data.decode(errors="replace")
