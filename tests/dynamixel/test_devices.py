@@ -1,8 +1,7 @@
-"""Devices in the exchange, also in storms, and parts of features on a bus; the simulated ledger judges."""
+"""Devices in the exchange, and parts of features on a bus; the simulated ledger judges."""
 
 import math
 import struct
-from functools import partial
 from importlib import import_module
 from itertools import count
 from pathlib import Path
@@ -12,7 +11,6 @@ import msgspec
 import numpy as np
 import pytest
 from msgspec.structs import replace
-from tests.kit.campaigns import campaign
 from tests.kit.line_faults import truncate_next
 from tests.kit.plans import make_plan
 from tests.kit.rigs import Rig, make_rig, start_rig
@@ -22,8 +20,6 @@ from dxlrun.dynamixel.bus_part import SafeEnd
 from dxlrun.errors import StartUpError
 from dxlrun.features.devices.plan import DeviceCommand
 from dxlrun.features.feature import Feature
-from dxlsim.faults.fault import parse_fault
-from dxlsim.faults.script import FaultScript
 from dxlwire.bus_plan import DevicePlan
 from dxlwire.control_table.device_table import read_device_table
 from dxlwire.plan.device_reads import device_blocks
@@ -325,83 +321,6 @@ def test_protocol_1_reads_each_device_by_itself_and_keeps_the_chain_of_servos():
     cycle_valid(rig, 50)
     assert not rig.sources.valid[0]
     assert rig.events.of(EventCode.DEVICE_LOST)
-
-
-LOSSES = ("lose servo={id}", "truncate servo={id} keep={keep}", "corrupt servo={id}")
-WORSE = ("delay servo={id} by={by}us", "duplicate servo={id}", "noise size={keep}", "lose from=host")
-ITEMS = (("speed",), ("speed", "rate"), ("speed", "led"), ("speed", "pwm", "warm", "led"))
-
-
-def storm(rig, chance, ids, kinds):
-    """Do something to the line, to a device, or to a servo."""
-    servo_id = chance.choice(ids)
-    if chance.random() < 0.3:
-        rig.buses[0].at(rig.clock.now_ns(), lambda: rig.servo(servo_id).silence(chance.random() < 0.4))
-        return
-    if not (rig.sources.valid.all() and rig.states.valid.all()):
-        return  # it waits for a reply, and would still wait at the end
-    text = chance.choice(kinds).format(
-        id=servo_id, keep=chance.randrange(4, 10), by=chance.randrange(100, 3000)
-    )
-    now_ns = rig.clock.now_ns()
-    script = FaultScript([parse_fault(text)], chance.randrange(1000))
-    script.attach(rig.buses, start_ns=now_ns, now_ns=now_ns)
-
-
-@campaign(ci=2, night=50, release=400)
-def test_a_storm_makes_no_state_old_and_costs_the_servos_nothing(number, chance):
-    only_devices = number % 2 == 0
-    capabilities = chance.choice((ALL, NONE, '["sync_read"]', '["bulk_read"]'))
-    wanted = [chance.choice(ITEMS) for _ in range(chance.randrange(1, 5))]
-    plan = make_plan(
-        SERVOS,
-        protocol=2.0,
-        model="XM430-W350",
-        devices=devices(*wanted, capabilities=capabilities),
-        fast=chance.random() < 0.5,
-        return_delay_ns=chance.choice((0, 250_000)),
-    )
-    rig = start_rig(plan)
-    rig.packets.list.clear()
-    rig.ledger.entries.clear()
-    ids = [each.servo_id for each in plan.devices] + [] * only_devices + list(SERVOS) * (not only_devices)
-    kinds = LOSSES if only_devices else (*LOSSES, *WORSE)
-    columns = {each.source: each.blocks[-1].fields[-1].column for each in plan.devices}
-    ages = np.zeros(len(wanted), dtype=np.int64)
-
-    def run_cycle(cycle):
-        for index in range(len(wanted)):
-            device(rig, index).registers["profile_velocity"] = 100 * cycle + index
-        rig.goals.position[:] += 0.001 * (-1) ** cycle
-        try:
-            rig.cycle()
-        except AssertionError:  # a cycle that is late: only a servo may make it so
-            assert not only_devices
-            rig.clock.wait_until(rig.clock.now_ns() + 1_000_000)
-        for row, column in columns.items():
-            if rig.sources.valid[row]:
-                assert rig.sources.values[column] == 100 * cycle + row
-                assert 0 <= rig.sources.age_ns[row] < 12_000_000
-            else:
-                assert rig.sources.age_ns[row] > ages[row]
-        ages[:] = rig.sources.age_ns
-        if only_devices:
-            assert rig.states.valid.all()
-
-    for cycle in range(200):
-        for _ in range(chance.choice((0, 0, 0, 1, 2))):
-            storm(rig, chance, ids, kinds)
-        run_cycle(cycle)
-    for servo_id in ids:  # behind what the storm has still to do
-        rig.buses[0].at(rig.clock.now_ns(), partial(rig.servo(servo_id).silence, on=False))
-    for cycle in range(200, 360):
-        run_cycle(cycle)
-    assert rig.sources.valid.all()
-    assert rig.states.valid.all()
-    assert rig.packets.sent() == rig.into_bus()
-    assert rig.packets.received() == rig.out_of_bus()
-    if only_devices:
-        assert set(rig.events.sources(EventCode.READ_LOST)) <= {one.name for one in plan.devices}
 
 
 NOTED = Feature("noted", "noted_feature")
