@@ -173,7 +173,7 @@ class GripCommand(CommandModel):
     @model_validator(mode="after")
     def _one_goal(self) -> Self:
         if (self.position is None) == (self.width is None):
-            raise ValueError("give either position or width")
+            raise ValueError("give either position or width; write for example width=5cm")
         return self
 
 
@@ -255,7 +255,8 @@ class GripperController(Controller[GripperParameters]):
         angles, widths = _table(parameters)
         if not widths.min() <= command.width <= widths.max():
             raise ValueError(
-                f"width {command.width:g} m is not between {widths.min():g} m and {widths.max():g} m"
+                f"width {command.width:g} m is not between {widths.min():g} m and {widths.max():g} m; "
+                "write a width in this range, with its unit"
             )
         order = np.argsort(widths)
         return np.array([np.interp(command.width, widths[order], angles[order]), effort])

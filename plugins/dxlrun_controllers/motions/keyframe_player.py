@@ -37,6 +37,7 @@ from dxlrun import (
     Tolerance,
     nearest_turn,
 )
+from dxlrun.tooling.files import suggestion
 from dxlrun_controllers.joint_parameters import (
     JointNames,
     commanded_by,
@@ -323,7 +324,7 @@ class KeyframePlayer(Controller[KeyframeParameters]):
             return super().prepare(kind, command, parameters)
         names = list(parameters.motions)
         if command.motion not in names:
-            raise ValueError(f"there is no motion {command.motion!r}; there are {', '.join(names)}")
+            raise ValueError(f"there is no motion {command.motion!r}; {suggestion(command.motion, names)}")
         repeat = command.repeat or parameters.motions[command.motion].repeat
         return np.array([names.index(command.motion), command.speed, repeat])
 
