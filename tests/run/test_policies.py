@@ -97,7 +97,7 @@ def test_controllers_are_deactivated_before_a_policy_moves_and_requests_are_refu
     during = masks[len(active) :]
     assert len(during) > 10
     assert set(during) == {0}
-    assert set(masks[: len(active)]) == {0b11}
+    assert set(masks[: len(active)]) == {0b111}
     assert run.answer(1) == Refusal(Code.RUN_ENDING)
 
 
