@@ -82,6 +82,13 @@ def test_what_a_controller_starts_while_the_robot_runs_is_refused_and_its_fault(
     assert children() == before
 
 
+def test_an_event_at_the_end_of_the_process_is_no_error(page, monkeypatch):
+    """The interpreter clears the globals of modules, and then still closes files."""
+    assert breach(Activity(page, lambda: 1), int) == ""
+    monkeypatch.setattr("dxlrun.control.controllers.activity._STARTS", None)
+    sys.audit("os.remove", "file", -1)
+
+
 def test_processes_are_for_on_configure_and_threads_of_others_are_theirs(robot):
     go, done = threading.Event(), threading.Event()
 
