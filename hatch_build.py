@@ -35,12 +35,13 @@ __all__ = [
 SOURCES = tuple(
     Path(*path)
     for path in (
-        ("dxlwire", "exchange", "kernel.c"),
-        ("dxlrun", "control", "gate.c"),
-        ("dxlsim", "wire", "line.c"),
-        ("dxlrun", "contract", "polynomial.c"),
-        ("dxlrun", "channels", "shared_memory.c"),
-        ("dxlsim", "motion", "mechanics.c"),
+        ("runtime", "dxlwire", "exchange", "kernel.c"),
+        ("runtime", "dxlrun", "control", "gate.c"),
+        ("runtime", "dxlsim", "wire", "line.c"),
+        ("runtime", "dxlrun", "contract", "polynomial.c"),
+        ("runtime", "dxlrun", "channels", "shared_memory.c"),
+        ("runtime", "dxlsim", "motion", "mechanics.c"),
+        ("plugins", "dxlrun_analysis", "servos", "pairing.c"),
     )
 )
 """Each is compiled into an object of its own, which lies beside it: libkernel.so."""
@@ -50,7 +51,7 @@ FLAGS = ("-std=c11", "-O2", "-fPIC", "-shared", "-ffp-contract=off", "-Wall", "-
 
 def compile_kernel(root: Path, compiler: list[str], target: Path, name: Path = SOURCES[0]) -> str:
     """Compile the kernel, or another source; return why that did not work, or nothing."""
-    source = root / "runtime" / name
+    source = root / name
     crc = f"-DSOURCE_CRC={zlib.crc32(source.read_bytes())}u"
     with tempfile.TemporaryDirectory() as cache:
         caches = {"ZIG_GLOBAL_CACHE_DIR": cache, "ZIG_LOCAL_CACHE_DIR": cache}
@@ -115,14 +116,14 @@ class KernelHook(BuildHookInterface[Any]):
             self.made = tempfile.mkdtemp()
         for source in SOURCES:
             made = source.with_name(f"lib{source.stem}.so")
-            target = Path(self.made, made.name) if self.made else root / "runtime" / made
+            target = Path(self.made, made.name) if self.made else root / made
             target.unlink(missing_ok=True)
             if why := compile_kernel(root, compiler or ["cc"], target, source):
                 raise RuntimeError(
                     f"{source.name} was not compiled; install a C compiler (sudo apt install gcc):\n{why}"
                 )
             if self.made:
-                build_data["force_include"][str(target)] = str(made)
+                build_data["force_include"][str(target)] = str(Path(*made.parts[1:]))
         platform = sysconfig.get_platform().replace("-", "_").replace(".", "_")
         build_data["tag"] = f"py3-none-{platform}"
         build_data["pure_python"] = False

@@ -1,6 +1,7 @@
 """Exchanges on the buses: which reply answers which request, whose loss a missing one is, who is accused."""
 
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 from tests.kit.made_logs import PLAN, Wire
 
+from bench import fuzz_pairing
 from dxlrun.channels.logged_packets import LoggedPacket
 from dxlrun.log.columns import PacketColumns
 from dxlrun_analysis.finding import Finding
@@ -101,6 +103,17 @@ def test_the_block_of_a_fast_status_that_comes_by_itself_is_late_and_breaks_no_o
     found = paired(wires)
     assert losses(found) == {3: Loss.NONE, 7: loss, 4: Loss.BEHIND}
     assert found.due.broken.tolist() == [False, False, False, loss is Loss.OWN]  # of the ping
+
+
+def test_any_packets_are_paired():
+    _, missing = fuzz_pairing.campaign(100, seed=7)
+    assert missing > 100
+
+
+def test_packets_outside_of_their_bytes_are_refused():
+    packets = columns([(ASK, 7, PING_7, 0)])
+    with pytest.raises(ValueError, match="end after their bytes"):
+        Pairing((BUS,)).alone(replace(packets, start=packets.start + 1))
 
 
 def test_packets_that_are_looked_at_alone_wait_for_no_others():

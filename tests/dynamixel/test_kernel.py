@@ -325,8 +325,8 @@ def build(tmp_path, monkeypatch):
     """The build, in a folder that has the sources."""
     module = loaded(ROOT / "hatch_build.py")
     for source in module.SOURCES:
-        (tmp_path / "runtime" / source).parent.mkdir(parents=True)
-        shutil.copy(ROOT / "runtime" / source, tmp_path / "runtime" / source)
+        (tmp_path / source).parent.mkdir(parents=True)
+        shutil.copy(ROOT / source, tmp_path / source)
     monkeypatch.chdir(tmp_path)
     return module
 

@@ -11,15 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun.tooling.logs import PacketColumns
-from dxlwire import BROADCAST_ID
 
 IDS = 256  # Servos are numbered by index of the bus times this, plus ID
 _HEADER_2 = b"\xff\xff\xfd\x00"
 _HEADER_2_NUMBER = int.from_bytes(_HEADER_2, "little")
 _STUFFED, _PLAIN = b"\xff\xff\xfd\xfd", b"\xff\xff\xfd"
-PING, _READ = 0x01, 0x02  # Instruction codes of both protocols
-_SYNC_READ, _FAST_SYNC_READ, _BULK_READ, _FAST_BULK_READ = 0x82, 0x8A, 0x92, 0x9A
-_FAST = (_FAST_SYNC_READ, _FAST_BULK_READ)
+_SYNC_READ, _FAST_SYNC_READ, _FAST_BULK_READ = 0x82, 0x8A, 0x9A  # Instruction codes
 _HEAD_2 = 8  # Bytes before error, ID and data of the blocks of a fast status packet
 _BEYOND = 1 << 17  # Longer than any packet
 _WORD = 8  # Bytes that are compared at once
@@ -93,34 +90,27 @@ class RequestTable:
         self.all = _ALONE
         self._known: dict[bytes, int] = {}
 
-    def request_indices(self, packets: PacketColumns) -> tuple[Numbers, Numbers]:
-        """Return the row of `all` and the instruction code of each instruction packet; add new requests."""
-        head = heads(packets)
-        second, code = second_of(head), instruction_of(head)
-        servo_id = np.where(second, head >> np.uint64(32), head >> np.uint64(16)).astype(np.uint8)
-        single = ((code == PING) | (code == _READ)) & (servo_id != BROADCAST_ID)
-        found = np.where(single, servo_id.astype(np.int64) + 1, 0)
-        many = np.isin(code, (_SYNC_READ, *_FAST)) & second | (code == _BULK_READ)
-        for length in np.unique(packets.length[many]).tolist():
-            rows = np.flatnonzero(many & (packets.length == length))
-            found[rows] = self._rows_of(packets.data, packets.start[rows], length)
+    def replace_samples(self, packets: PacketColumns, instruction: Numbers, request: Numbers) -> None:
+        """Replace each request of several servos by its row of `all`; add new requests.
+
+        Args:
+            packets: The packets.
+            instruction: Row of the instruction of each exchange, shape (exchanges,).
+            request: Request of each exchange; that of several servos is -1 minus the index of an exchange
+                with the same instruction.
+        """
+        several = np.flatnonzero(request < 0)
+        sample = -1 - request[several]
+        first = several[sample == several]
+        start = packets.start[instruction[first]]
+        ends = start + packets.length[instruction[first]]
+        for one, begin, end in zip(first.tolist(), start.tolist(), ends.tolist(), strict=True):
+            text = packets.data[begin:end].tobytes()
+            request[one] = self._known.setdefault(text, len(_ALONE.kinds) + len(self._known))
+        request[several] = request[sample]
         new = tuple(self._known)[len(self.all.kinds) - len(_ALONE.kinds) :]
         if new:
             self.all = self.all.and_more(tuple(map(request_of, new)))
-        return found, code
-
-    def _rows_of(self, data: NDArray[np.uint8], start: Numbers, length: int) -> Numbers:
-        """Return the row of each request in `data`, all of one length; note new ones in `_known`."""
-        words = [_words(data, start + at, length - at) for at in range(0, length, _WORD)]
-        found, left = np.zeros(len(start), np.int64), np.arange(len(start))
-        # A log has few distinct reads of several servos, so this takes few passes.
-        while len(left):
-            begin = start[left[0]]
-            same = np.logical_and.reduce([word[left] == word[left[0]] for word in words])
-            text = data[begin : begin + length].tobytes()
-            found[left[same]] = self._known.setdefault(text, len(_ALONE.kinds) + len(self._known))
-            left = left[~same]
-        return found
 
 
 def heads(packets: PacketColumns) -> Words:
@@ -154,20 +144,16 @@ def second_of(head: NDArray[np.uint64]) -> Flags:
 
 
 def request_of(data: bytes) -> LoggedRequest:
-    """Parse one instruction packet: return the servos that it asks. Only pings and reads count, which
-    servos answer at every status return level."""
-    second = data.startswith(_HEADER_2)
-    servo_id, code = (_byte(data, 4), _byte(data, 7)) if second else (_byte(data, 2), _byte(data, 4))
-    if code in (PING, _READ):
-        return LoggedRequest() if servo_id == BROADCAST_ID else LoggedRequest((servo_id,))
-    if not second:
-        return _entries(data[6:-1], 3, 1, fast=False) if code == _BULK_READ else LoggedRequest()
-    body = data[8:-2].replace(_STUFFED, _PLAIN)
-    fast = code in _FAST
+    """Parse an instruction packet that reads several servos; `pairing.c` finds these packets. Only pings
+    and reads count as requests, which servos answer at every status return level."""
+    if not data.startswith(_HEADER_2):
+        return _entries(data[6:-1], 3, 1, fast=False)
+    code, body = data[7], data[8:-2].replace(_STUFFED, _PLAIN)
+    fast = code in (_FAST_SYNC_READ, _FAST_BULK_READ)
     if code in (_SYNC_READ, _FAST_SYNC_READ):
         sizes = (int.from_bytes(body[2:4], "little"),) * len(body[4:])
         return LoggedRequest(tuple(dict.fromkeys(body[4:])), sizes, fast)
-    return _entries(body, 5, 0, fast=fast) if code in (_BULK_READ, _FAST_BULK_READ) else LoggedRequest()
+    return _entries(body, 5, 0, fast=fast)
 
 
 def _entries(body: bytes, width: int, at: int, *, fast: bool) -> LoggedRequest:
@@ -178,7 +164,3 @@ def _entries(body: bytes, width: int, at: int, *, fast: bool) -> LoggedRequest:
     entries = [body[start : start + width] for start in range(0, len(body) - width + 1, width)]
     sizes = (entry[0] if at else int.from_bytes(entry[3:5], "little") for entry in entries)
     return LoggedRequest(tuple(dict.fromkeys(entry[at] for entry in entries)), tuple(sizes), fast)
-
-
-def _byte(data: bytes, index: int) -> int:
-    return data[index] if index < len(data) else 0

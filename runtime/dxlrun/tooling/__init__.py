@@ -20,6 +20,7 @@ here contain no code: each is a page of names, and each name is imported on firs
 | `logs` | logs: finding, reading, following |
 | `records` | the contents of a log: cycles, packets, events, commands |
 | `topics` | names of topics, and their messages as bytes |
+| `compiled_code` | C code that a package's build has compiled |
 
 This verb counts the cycles of a log; the plug-in module of its package registers it:
 
