@@ -102,6 +102,10 @@ def pair(chance: random.Random) -> int:
     assert sorted(answers.tolist()) == np.flatnonzero(replies.answers).tolist()
     assert due.missing.tolist() == np.flatnonzero(due.reply < 0).tolist()
     assert len(due.exchange) == found.requests.servos[found.request].sum()
+    assert (found.count_due(np.arange(len(found.bus))) == np.bincount(due.servo, minlength=512)).all()
+    last = np.full(len(found.bus), -1)
+    last[replies.exchange[replies.answers]] = np.flatnonzero(replies.answers)
+    assert found.answer.tolist() == last.tolist()
     asked = int(np.count_nonzero(packets.kind == PacketKind.INSTRUCTION))
     assert len(found.bus) == asked + BUSES
     assert (np.diff(found.bus) >= 0).all()

@@ -36,11 +36,12 @@ class BrokenReplies:
         due, buses = exchanges.due, len(self._noisy)
         # Count the first servo of a chain without an intact reply, if the bytes fit into its reply alone.
         longest = np.array([max(kind.sizes, default=0) + _BESIDE for kind in exchanges.requests.kinds])
-        noise = exchanges.noise[due.exchange]
-        first = (due.loss == Loss.LINE) & (due.place == 0) & (noise > 0)
-        first &= noise <= longest[exchanges.request[due.exchange]]
-        self._first += np.bincount(due.servo[first & exchanges.ended[due.exchange]], minlength=buses * IDS)
-        rows = np.flatnonzero((due.broken | first) & exchanges.ended[due.exchange])
+        rows = due.missing[exchanges.ended[due.exchange[due.missing]]]
+        noise = exchanges.noise[due.exchange[rows]]
+        first = (due.loss[rows] == Loss.LINE) & (due.place[rows] == 0) & (noise > 0)
+        first &= noise <= longest[exchanges.request[due.exchange[rows]]]
+        self._first += np.bincount(due.servo[rows[first]], minlength=buses * IDS)
+        rows = rows[due.broken[rows] | first]
         servo, request = due.servo[rows], exchanges.request[due.exchange[rows]]
         ends = due.place[rows] == exchanges.requests.servos[request] - 1
         cut = servo[ends & exchanges.requests.fast[request]]
@@ -49,7 +50,7 @@ class BrokenReplies:
         self._noisy += np.bincount(exchanges.bus[(exchanges.noise > 0) & exchanges.ended], minlength=buses)
         # In an incomplete fast status packet, stray bytes are cut blocks.
         incomplete = np.zeros(len(exchanges.request), np.bool_)
-        incomplete[due.exchange[due.reply < 0]] = True
+        incomplete[due.exchange[due.missing]] = True
         cut_blocks = exchanges.requests.fast[exchanges.request] & incomplete
         disturbed = (exchanges.noise > 0) & ~cut_blocks
         self._disturbed += np.bincount(exchanges.bus[disturbed], minlength=buses)

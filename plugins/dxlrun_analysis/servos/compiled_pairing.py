@@ -34,6 +34,7 @@ class ExchangeColumns(NamedTuple):
     sent_ns: Numbers
     last_ns: Numbers
     noise: Numbers
+    answer: Numbers
     row: Numbers  # Row of the instruction in the packets; -1 without one
     asked_id: Numbers  # ID in the instruction; -1: any servo may answer, or no instruction
 
@@ -105,7 +106,7 @@ class CompiledPairing:
         return _STRUCTS[name](**{key: one.ctypes.data for key, one in columns.items()}, **numbers)
 
     def split_packets(self) -> tuple[ExchangeColumns, Numbers]:
-        """Return the exchanges, without `last_ns`, and the exchange of each packet.
+        """Return the exchanges, without `last_ns` and `answer`, and the exchange of each packet.
 
         A request of several servos is -1 minus the index of an exchange with the same instruction.
 
@@ -123,7 +124,7 @@ class CompiledPairing:
     def pair_replies(
         self, exchanges: ExchangeColumns, exchange: Numbers, requests: DistinctRequests
     ) -> tuple[Replies, DueReplies]:
-        """Return the replies and the requested replies; set `last_ns` of the exchanges.
+        """Return the replies and the requested replies; set `last_ns` and `answer` of the exchanges.
 
         Args:
             exchanges: The exchanges, with rows of `requests` as requests.

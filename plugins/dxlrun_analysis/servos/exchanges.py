@@ -44,6 +44,7 @@ class Exchanges(NamedTuple):
     """False if the log ends before the next instruction on the bus. A missing reply may then have come
     after the end of the log."""
     noise: Numbers  # Bytes that belong to no intact packet
+    answer: Numbers  # Index in `replies` of the last one that was requested; -1: none
     replies: Replies
     due: DueReplies
     late: LateReplies
@@ -55,11 +56,28 @@ class Exchanges(NamedTuple):
     def complete(self) -> tuple[Numbers, Numbers]:
         """Return the rows of the exchanges that all servos answered, and the time of their last reply beyond
         wire time and return delay, ns."""
-        answers, asked = np.flatnonzero(self.replies.answers), self.requests.servos[self.request]
-        of, last = self.replies.exchange[answers], np.zeros(len(self.request), np.int64)
-        last[of] = answers
-        rows = np.flatnonzero((np.bincount(of, minlength=len(asked)) == asked) & (asked > 0))
-        return rows, self.replies.last_ns[last[rows]] - self.replies.due_ns[last[rows]]
+        whole = self.requests.servos[self.request] > 0
+        whole[self.due.exchange[self.due.missing]] = False
+        rows = np.flatnonzero(whole)
+        last = self.answer[rows]
+        return rows, self.replies.last_ns[last] - self.replies.due_ns[last]
+
+    def first_servos(self, rows: Numbers) -> Numbers:
+        """Return the servo that each of the exchanges in `rows` asks first; each asks at least one."""
+        begins = self.requests.begins[self.request[rows]]
+        return self.bus[rows] * IDS + self.requests.ids[begins]
+
+    def count_due(self, rows: Numbers) -> Numbers:
+        """Return how often the exchanges in `rows` ask each servo, shape (buses times 256,)."""
+        requests, kinds = self.requests, len(self.requests.servos)
+        count = np.zeros(len(self.buses) * IDS, np.int64)
+        # A log has few distinct requests, and many exchanges with each.
+        times = np.bincount(self.bus[rows] * kinds + self.request[rows])
+        for key in np.flatnonzero(times).tolist():
+            bus, request = divmod(key, kinds)
+            begin = requests.begins[request]
+            count[bus * IDS + requests.ids[begin : begin + requests.servos[request]]] += times[key]
+        return count
 
 
 @unique
@@ -170,6 +188,7 @@ class Pairing:
             *columns[:7],
             ended,
             columns.noise,
+            columns.answer,
             replies,
             due,
             late,

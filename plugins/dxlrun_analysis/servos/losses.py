@@ -30,7 +30,7 @@ from dxlrun_analysis.finding import Finding, cause
 from dxlrun_analysis.plan_excerpt import LoggedBus
 from dxlrun_analysis.servos.exchanges import Exchanges, Loss
 from dxlrun_analysis.servos.joint_states import ANGLE, BINS, QUANTITIES, JointStates, Places
-from dxlrun_analysis.servos.logged_requests import IDS, Flags, Numbers
+from dxlrun_analysis.servos.logged_requests import IDS, Numbers
 
 _APART_NS = (
     200_000_000  # Occasions of one part within this time after the first count as one: a plug can flicker
@@ -103,45 +103,52 @@ class Losses:
 
     def add_exchanges(self, exchanges: Exchanges, places: Places) -> None:
         """Add the missing replies of some exchanges; `places` has the joint states in their cycles."""
-        due, count = exchanges.due, exchanges.requests.servos[exchanges.request]
-        ended, exchange, bus = exchanges.ended[due.exchange], due.exchange, due.servo // IDS
+        due, ended, exchange = exchanges.due, exchanges.ended, exchanges.due.exchange
+        count, missing = exchanges.requests.servos[exchanges.request], due.missing
         cycles = _moments(exchanges)
-        came = (due.reply >= 0) | (due.loss == Loss.LATE)
-        missing = ended & ~came
-        own, several = missing & (due.loss == Loss.OWN), count > 1
-        nothing = missing & (due.loss == Loss.LINE) & (due.place == 0)
+        lost = missing[due.loss[missing] != Loss.LATE]
+        rows = lost[ended[exchange[lost]]]
+        own = due.loss[rows] == Loss.OWN
+        nothing = (due.loss[rows] == Loss.LINE) & (due.place[rows] == 0)
+        # A servo could have answered if no reply before its own was missing.
         first = np.full(len(count), IDS, np.int64)
-        first[exchange[own | nothing]] = due.place[own | nothing]
-        could = ended & (due.reply >= 0) & (due.place < first[exchange])
-        asked = ended & (count > 0)[exchange]
-        for counts, rows in (
-            (self._chains, asked & several[exchange] & (due.place == 0)),
-            (self._broken_off, nothing),
-            (self._alone, asked & ~several[exchange]),
-            (self._lost_alone, own & ~several[exchange]),
-            (self._asked, could | own),
-            (self._lost, own),
+        first[exchange[rows[own | nothing]]] = due.place[rows[own | nothing]]
+        behind = np.flatnonzero((first < IDS)[exchange])
+        behind = behind[(due.reply[behind] >= 0) & (due.place[behind] > first[exchange[behind]])]
+        closed = missing[ended[exchange[missing]]]
+        everything = exchanges.count_due(np.arange(len(count)))
+        self._asked += everything - exchanges.count_due(np.flatnonzero(~ended))
+        self._asked -= np.bincount(due.servo[np.append(closed, behind)], minlength=len(self._asked))
+        for counts, servo in (
+            (self._chains, exchanges.first_servos(np.flatnonzero(ended & (count > 1)))),
+            (self._broken_off, due.servo[rows[nothing]]),
+            (self._alone, exchanges.first_servos(np.flatnonzero(ended & (count == 1)))),
+            (self._lost_alone, due.servo[rows[own & (count[exchange[rows]] == 1)]]),
+            (self._asked, due.servo[rows[own]]),
+            (self._lost, due.servo[rows[own]]),
         ):
-            np.add(counts, np.bincount(due.servo[rows], minlength=len(counts)), out=counts)
-        rows = np.flatnonzero(missing)
-        answers = _before(rows, bus, came, self._answers)
-        answered = _before(rows, due.servo, came, self._answered)
+            np.add(counts, np.bincount(servo, minlength=len(counts)), out=counts)
+        answers, answered = (
+            _before(rows, due.servo, width, lost, so_far)
+            for width, so_far in ((IDS, self._answers), (1, self._answered))
+        )
+        came = everything - np.bincount(due.servo[lost], minlength=len(everything))
+        self._answered += came
+        self._answers += came.reshape(-1, IDS).sum(axis=1)
         joint = self._states.joint_of[due.servo[rows]]
         at = np.searchsorted(places.cycle, exchanges.cycle[exchange[rows]])
-        missed = zip(
-            rows.tolist(), joint.tolist(), at.tolist(), answers.tolist(), answered.tolist(), strict=True
-        )
-        for row, of, place, seen, now in missed:
+        columns = (rows, own, nothing, joint, at, answers, answered)
+        missed = zip(*(column.tolist() for column in columns), strict=True)
+        for row, is_own, whole, of, place, seen, now in missed:
             servo, at_ns = int(due.servo[row]), int(exchanges.asked_ns[exchange[row]])
             cycle = int(cycles[exchange[row]])
             out = self._open.get(servo)
             if out is not None and out.answered == now:
                 if at_ns - out.at_ns <= _APART_NS:
                     out.last, out.last_answers = cycle, seen
-            elif (own[row] or nothing[row]) and len(self._outages) < _MOST_KEPT:
+            elif (is_own or whole) and len(self._outages) < _MOST_KEPT:
                 known = of >= 0 and place < len(places.cycle)
                 where = places.bins[:, of, place].tolist() if known else [-1] * len(QUANTITIES)
-                whole = bool(nothing[row])
                 out = _Outage(servo, at_ns, cycle, where, seen, now, whole, cycle, seen)
                 self._open[servo] = out
                 self._outages.append(out)
@@ -385,19 +392,21 @@ def _moments(exchanges: Exchanges) -> Numbers:
     return np.where(exchanges.cycle > BEFORE_FIRST_CYCLE, exchanges.cycle, before)
 
 
-def _before(rows: Numbers, group: Numbers, came: Flags, so_far: Numbers) -> Numbers:
+def _before(rows: Numbers, servo: Numbers, width: int, lost: Numbers, so_far: Numbers) -> Numbers:
     """Return, for some due replies, how many replies of the same group (bus or servo) came before them.
 
     Args:
-        rows: Indices of these due replies, ascending.
-        group: Group of all due replies.
-        came: Which of all due replies came.
-        so_far: Number of replies of each group before; the new ones are added.
+        rows: Indices of these due replies.
+        servo: Servo of all due replies.
+        width: Number of servos in a group: 256 for a bus, or 1.
+        lost: Indices of the due replies that did not come.
+        so_far: Number of replies of each group before.
     """
-    before = so_far[group[rows]]
-    for number in np.unique(group[rows]).tolist():
-        mine = np.flatnonzero(group[rows] == number)
-        of_group = np.cumsum(came & (group == number))
-        before[mine] += of_group[rows[mine]]
-    so_far += np.bincount(group[came], minlength=len(so_far))
+    group = servo[rows] // width
+    before: Numbers = so_far[group]
+    for number in np.unique(group).tolist():
+        came = servo // width == number
+        came[lost] = False
+        mine = np.flatnonzero(group == number)
+        before[mine] += np.cumsum(came)[rows[mine]]
     return before

@@ -34,6 +34,7 @@ _MOST_NAMED = 3
 _ALL = 0.9  # Share of echoed instructions from which the adapter always echoes, which is permitted
 _LONGEST = 48  # Bytes after the length field; longer instructions are not searched for
 _PIECES = 0.1  # Share of the stray bytes from which ends of instructions are not a coincidence
+_LOST = (Loss.OWN, Loss.LINE)  # Losses that another host can have caused
 _PING, _READ, _WRITE, _SYNC_WRITE, _BULK_READ = 0x01, 0x02, 0x03, 0x83, 0x92
 
 
@@ -59,7 +60,7 @@ class OtherHosts:
         self._pieces.count_values(*_ends(stray, second[stray.bus]))
         for counts, buses in (
             (self._stray, stray.bus),
-            (self._lost, due.servo[(due.loss == Loss.OWN) | (due.loss == Loss.LINE)] // IDS),
+            (self._lost, due.servo[due.missing[np.isin(due.loss[due.missing], _LOST)]] // IDS),
             (self._echoes, exchanges.echoes),
             (self._asked, exchanges.bus[exchanges.asked_ns > 0]),
         ):

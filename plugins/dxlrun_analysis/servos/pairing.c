@@ -42,6 +42,7 @@ typedef struct { /* columns of `DistinctRequests` */
 
 typedef struct { /* columns of `Exchanges`, and: */
     int64_t *bus, *cycle, *request, *asked_ns, *blocked_ns, *sent_ns, *last_ns, *noise;
+    int64_t *answer;
     int64_t *row;      /* row of the instruction; -1 without one */
     int64_t *asked_id; /* ID in the instruction; -1: any servo may answer, or no instruction */
     int64_t count;
@@ -213,13 +214,14 @@ int64_t pairing_count_replies(
     return found;
 }
 
-/* Fill in the replies, the requested replies, and `last_ns` of the exchanges. Return the number of missing replies. */
+/* Fill in the replies, the requested replies, `last_ns` and `answer` of the exchanges. Return the number of missing replies. */
 int64_t pairing_pair_replies(const Packets *packets, const Buses *buses, const Requests *requests,
     const Exchanges *exchanges, const int64_t *exchange, const Replies *replies, const DueReplies *due)
 {
     int64_t next = 0, reply = 0, begin = 0, lacking = 0;
     for (int64_t at = 0; at < exchanges->count; at++) {
         int64_t request = exchanges->request[at], bus = exchanges->bus[at], servos = requests->servos[request];
+        exchanges->answer[at] = -1;
         int64_t due_ns = exchanges->sent_ns[at], before_ns = due_ns, last_ns = due_ns, missing = servos;
         for (int64_t place = 0; place < servos; place++) {
             due->exchange[begin + place] = at, due->place[begin + place] = place;
@@ -252,7 +254,7 @@ int64_t pairing_pair_replies(const Packets *packets, const Buses *buses, const R
                 int answers = place >= 0 && in_time && due->reply[begin + place] < 0;
                 replies->answers[reply] = (uint8_t)answers;
                 if (answers) {
-                    due->reply[begin + place] = reply, missing--;
+                    due->reply[begin + place] = exchanges->answer[at] = reply, missing--;
                 }
                 last_ns = larger(last_ns, packets->last_ns[row]);
             }

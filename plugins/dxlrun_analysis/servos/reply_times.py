@@ -71,23 +71,25 @@ class ReplyTimes:
             losses: Receives the late exchanges.
         """
         replies, late = exchanges.replies, exchanges.late
-        count, requests = len(replies.exchange), exchanges.requests
+        requests = exchanges.requests
         self._exchanges += np.bincount(
             exchanges.bus[requests.servos[exchanges.request] > 0], minlength=len(self._exchanges)
         )
-        first = np.flatnonzero(np.diff(replies.exchange, prepend=-1))
-        number = np.arange(count) - np.repeat(first, np.diff(np.append(first, count)))
-        own_ns = replies.last_ns - replies.before_ns - replies.wire_ns
         asked = np.where(requests.fast, 0, requests.servos)[exchanges.request]
+        rows = np.flatnonzero((asked > 0)[replies.exchange])
+        of, count, wire_ns = replies.exchange[rows], len(rows), replies.wire_ns[rows]
+        first = np.flatnonzero(np.diff(of, prepend=-1))
+        number = np.arange(count) - np.repeat(first, np.diff(np.append(first, count)))
+        own_ns = replies.last_ns[rows] - replies.before_ns[rows] - wire_ns
         kinds = np.where(asked == 1, np.where(_rested(exchanges), _RESTED, _NEXT), _FIRST)
         kinds[np.diff(exchanges.cycle, prepend=-2) != 0] = _FIRST
         # A reply that took less than half its wire time was delivered together with the preceding one.
-        together = (number > 0) & (own_ns < -(replies.wire_ns // 2))
+        together = (number > 0) & (own_ns < -(wire_ns // 2))
         followed = np.append(together[1:], False) if count else together
-        in_turn = replies.answers & (replies.place == number)
-        known = np.flatnonzero(in_turn & (asked[replies.exchange] > 0) & ~together & ~followed)
-        kind = np.where(number[known] == 0, kinds[replies.exchange[known]], _CHAINED)
-        self._own_us.count_values(replies.servo[known] * len(_KINDS) + kind, own_ns[known] // 1000)
+        in_turn = replies.answers[rows] & (replies.place[rows] == number)
+        known = np.flatnonzero(in_turn & ~together & ~followed)
+        kind = np.where(number[known] == 0, kinds[of[known]], _CHAINED)
+        self._own_us.count_values(replies.servo[rows[known]] * len(_KINDS) + kind, own_ns[known] // 1000)
         # Replies that were given up count from the end of the preceding reply.
         rows = np.flatnonzero((late.exchange >= 0) & ~_in_time(exchanges))
         of, servo = late.exchange[rows], late.servo[rows]
@@ -100,13 +102,12 @@ class ReplyTimes:
         kind = np.where(behind, _CHAINED, kinds[of])[alone]
         own_us = (late.at_ns[rows] - begun_ns[of])[alone] // 1000
         self._own_us.count_values(servo[alone] * len(_KINDS) + kind, own_us)
-        self._take_late(exchanges, complete, own_ns, (of, servo, late.late_ns[rows]), losses)
+        self._take_late(exchanges, complete, (of, servo, late.late_ns[rows]), losses)
 
     def _take_late(
         self,
         exchanges: Exchanges,
         complete: tuple[Numbers, Numbers],
-        own_ns: Numbers,
         given_up: tuple[Numbers, ...],
         losses: Losses,
     ) -> None:
@@ -115,7 +116,6 @@ class ReplyTimes:
         Args:
             exchanges: The exchanges.
             complete: The complete ones among them, and their delay.
-            own_ns: Own time of each reply.
             given_up: Exchange, servo and lateness (ns) of each late reply that was given up.
             losses: Receives the late exchanges.
         """
@@ -130,7 +130,8 @@ class ReplyTimes:
         is_late[whole] = True
         answers = np.flatnonzero(replies.answers & is_late[replies.exchange])
         of = replies.exchange[answers]
-        order = np.lexsort((own_ns[answers], of))
+        own_ns = replies.last_ns[answers] - replies.before_ns[answers] - replies.wire_ns[answers]
+        order = np.lexsort((own_ns, of))
         slowest = np.full(count, -1, np.int64)
         slowest[of[order]] = answers[order]
         lacks, first = np.unique(given_up[0], return_index=True)
@@ -139,9 +140,9 @@ class ReplyTimes:
         fast = exchanges.requests.fast[exchanges.request[whole]]
         of_any = exchanges.bus[whole] * IDS + BROADCAST_ID
         servo = np.append(np.where(fast, of_any, replies.servo[slowest[whole]]), given_up[1][first])
-        single, requests = due == 1, exchanges.requests
+        single = due == 1
         for counts, at in ((self._single, np.flatnonzero(single)), (self._single_late, rows[single[rows]])):
-            asked = exchanges.bus[at] * IDS + requests.ids[requests.begins[exchanges.request[at]]]
+            asked = exchanges.first_servos(at)
             np.add(counts, np.bincount(asked, minlength=len(counts)), out=counts)
         self._late_us.count_values(servo, np.append(extra_ns, given_up[2][first]) // 1000)
         losses.late(servo // IDS, exchanges, rows)

@@ -101,7 +101,7 @@ class Traffic:
         )
         self._protocol = np.ones(servos, np.int64)
         self._seen = np.zeros(servos, np.bool_)
-        self._errors = np.zeros((servos, _BYTES), np.int64)  # By error byte
+        self._errors = np.zeros((servos, _BYTES), np.int64)  # By error byte; 0 is not counted
 
     def add_slice(self, log: Log) -> None:
         """Count the packets of the next slice of the log.
@@ -179,17 +179,24 @@ class Traffic:
         self._others.add_exchanges(exchanges)
         count, due, replies = len(self._asked), exchanges.due, exchanges.replies
         # A request that is open at the end of the log may have been answered later.
-        lost = (due.reply < 0) & exchanges.ended[due.exchange]
-        for counts, servo in (
-            (self._asked, due.servo[(due.reply >= 0) | lost]),
-            (self._lost, due.servo[lost]),
-            (self._replies, replies.servo),
-        ):
-            np.add(counts, np.bincount(servo, minlength=count), out=counts)
-        self._seen[due.servo] = self._seen[replies.servo] = True
+        ended = exchanges.ended[due.exchange[due.missing]]
+        asked, others = exchanges.count_due(np.arange(len(exchanges.bus))), np.flatnonzero(~replies.answers)
+        missing, unanswered, more, opened = (
+            np.bincount(servo, minlength=count)
+            for servo in (
+                due.servo[due.missing],
+                due.servo[due.missing[ended]],
+                replies.servo[others],
+                due.servo[due.missing[~ended]],
+            )
+        )
+        self._asked += asked - opened
+        self._lost += unanswered
+        self._replies += asked - missing + more
+        self._seen |= (asked > 0) | (more > 0)
         self._protocol[replies.servo] = replies.protocol  # The last reply of a servo counts
-        errors = np.bincount(replies.servo * _BYTES + replies.error, minlength=self._errors.size)
-        self._errors += errors.reshape(self._errors.shape)
+        rows = np.flatnonzero(replies.error)
+        np.add.at(self._errors, (replies.servo[rows], replies.error[rows]), 1)
         answers = np.flatnonzero(replies.answers)
         servo, of = replies.servo[answers], replies.exchange[answers]
         took_ns = replies.last_ns[answers] - exchanges.asked_ns[of]
@@ -203,7 +210,7 @@ class Traffic:
         bus, servo_id = self._pairing.buses[index // IDS], index % IDS
         names, devices = bus.names, {device.servo_id for device in bus.devices}
         errors = self._errors[index]
-        found = {error for error in np.flatnonzero(errors).tolist() if error}
+        found = set(np.flatnonzero(errors).tolist())
         times = self._reply_us.counts_of(index)
         return ServoTraffic(
             bus=bus.name,
@@ -214,7 +221,7 @@ class Traffic:
             asked=int(self._asked[index]),
             lost=int(self._lost[index]),
             replies=int(self._replies[index]),
-            errors=int(errors[1:].sum()),
+            errors=int(errors.sum()),
             error_names=error_names(int(self._protocol[index]), found),
             reply_median_us=median(*times),
             reply_max_us=int(self._reply_max_ns[index]) / 1e3,
