@@ -153,10 +153,12 @@ class FrozenSources:
             return
         self._plan, self._states = plan_of(log), dict(log.header.sources)
         known = {source.name for source in self._plan.loop.sources}
+        names = [(index, name) for index, (name, states) in enumerate(self._states.items()) if states]
+        names = [(index, name) for index, name in names if name in known]
+        if not names:
+            return
         position, at_ns = np.nan_to_num(log.cycles["position"]), log.cycles["read_ns"]
-        for index, (name, states) in enumerate(self._states.items()):
-            if name not in known or not states:
-                continue
+        for index, name in names:
             valid = log.cycles["source_valid"][:, index]
             values = np.nan_to_num(log.cycles["source_state"][:, log.header.layout.source_slice(name)])
             if name not in self._sources:

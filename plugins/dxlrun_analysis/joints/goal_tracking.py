@@ -32,6 +32,8 @@ _SETTLED_PART, _SETTLED_TICKS = 0.02, 2
 _MOVED_TICKS = 4  # Shorter movements give no lag, because positions are quantized in ticks
 _BLOCK = 1 << 16  # Cycles times joints that are processed at once, with eight joints at least
 _LONGEST_REST_S = 20.0  # A longer rest is counted as two
+# Compared with a member of an enumeration, NumPy converts each element to 64 bits.
+_GIVEN, _REBOOTING, _LOST = map(int, (Torque.GIVEN, Torque.REBOOTING, Torque.LOST))
 
 Flags = NDArray[np.bool_]
 
@@ -94,7 +96,7 @@ def _sent(columns: JointColumns, row: int, limits: PlannedJoint) -> _SentGoals:
     goal, position, commanded = (
         columns[name][row] for name in ("goal_position", "position", "goal_velocity")
     )
-    given, valid = columns["torque"][row] == Torque.GIVEN, columns["valid"][row]
+    given, valid = columns["torque"][row] == _GIVEN, columns["valid"][row]
     # When torque is enabled, the servo holds its position; an earlier goal no longer applies.
     if given.any():
         goal = np.where(given, np.nan, goal)
@@ -347,11 +349,11 @@ class _JointAccumulator:
         """Add the cycles from number `known` on; the first `known` were already added. Return the
         reachable trajectory of all, rad."""
         new = {name: columns[name][self.row, known:] for name in ("valid", "torque", "age_ns", "clamped")}
-        missing = ~new["valid"] & (new["torque"] != Torque.REBOOTING)
+        missing = ~new["valid"] & (new["torque"] != _REBOOTING)
         self.invalid += int(np.count_nonzero(missing))
         self.oldest_ns = max(self.oldest_ns, int(new["age_ns"].max(initial=0)))
         self.clamped += int(np.count_nonzero(new["clamped"]))
-        if self.lost_at is None and len(lost := np.flatnonzero(new["torque"] == Torque.LOST)):
+        if self.lost_at is None and len(lost := np.flatnonzero(new["torque"] == _LOST)):
             at = columns["position"][self.row, known + lost[0]]
             self.lost_at = float(at) if math.isfinite(at) else None
         sent = _sent(columns, self.row, self.limits)

@@ -113,7 +113,7 @@ class Movement:
         np.divide(np.abs(np.diff(columns["position"])), columns.steps, out=moved[:, 1:])
         new = {name: columns[name][..., known:] for name in _FIELDS}
         way, speed, moved, position = way[:, known:], speed[:, known:], moved[:, known:], new["position"]
-        has_torque = new["torque"] == Torque.ON
+        has_torque = new["torque"] == int(Torque.ON)
         moves = has_torque & new["valid"]
         # A joint with an effort goal has no reachable trajectory.
         by_effort = np.isfinite(new["goal_effort"])
@@ -185,10 +185,11 @@ class Movement:
         extent = np.fmax.reduce(values, axis=1) - np.fmin.reduce(values, axis=1)
         for row in np.flatnonzero(~(extent < least)).tolist():
             known = np.flatnonzero(np.isfinite(values[row]))
-            mine = values[row, known]
-            new = np.flatnonzero(np.diff(mine, prepend=math.nan) != 0)  # Goals are constant between commands
-            steps = np.diff(mine[new])
-            turns = new[np.flatnonzero(steps[1:] * steps[:-1] < 0) + 1]
+            mine = values[row] if len(known) == values.shape[1] else values[row, known]
+            steps = np.diff(mine)
+            moves = np.flatnonzero(steps)  # Goals are constant between commands
+            steps = steps[moves]
+            turns = moves[np.flatnonzero(steps[1:] * steps[:-1] < 0)] + 1
             far = np.abs(np.diff(mine[turns])) >= least[row]
             # Only swings without missing cycles in between count.
             swings = turns[1:][far & (np.diff(known[turns]) == np.diff(turns))]
