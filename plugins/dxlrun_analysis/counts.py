@@ -33,7 +33,10 @@ class Counts:
             group: Group of each value, 0 to 2^23; shape (values,).
             value: Values to count; shape (values,).
         """
-        self._pending.append((group << _GROUP) + np.clip(value, -_ZERO, _ZERO - 1) + _ZERO)
+        key = np.clip(value, -_ZERO, _ZERO - 1)
+        key += _ZERO
+        key += group << _GROUP
+        self._pending.append(key)
         self._waiting += len(value)
         if self._waiting > _MOST_PENDING:
             self._merge()
