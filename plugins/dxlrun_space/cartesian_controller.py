@@ -6,7 +6,7 @@ import math
 from collections.abc import Generator, Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Annotated, ClassVar, Final, Literal, TypeAlias
+from typing import Annotated, ClassVar, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,7 +46,7 @@ from dxlrun_space.path import (
     plan_line,
     plan_positions,
 )
-from dxlrun_space.solver import Solver, demands_orientation, distance, residual_of
+from dxlrun_space.solver import Orientation, Solver, demands_orientation, distance, residual_of
 from dxlrun_space.space_goals import PoseCommand, TwistCommand, packed, unpacked
 from dxlrun_space.stream import TipMotion, Twist
 
@@ -68,9 +68,9 @@ class TranslationLimits(ParametersModel):
     """Limits of the tip's translation."""
 
     velocity: Annotated[LinearVelocity, Field(gt=0)] = 0.2
-    """Highest speed of the tip, m/s."""
+    """Highest speed of the tip, m/s; near a singularity a twist leaves its direction to keep it."""
     acceleration: Annotated[LinearAcceleration, Field(gt=0)] = 0.5
-    """Highest acceleration of the tip, m/s^2."""
+    """Highest acceleration of the tip, m/s^2; near a singularity joints and `velocity` may need more."""
 
 
 class RotationLimits(ParametersModel):
@@ -110,7 +110,7 @@ class CartesianParameters(ParametersModel):
     """Link of the URDF in whose axes poses are; empty: the root."""
     linear: TranslationLimits = TranslationLimits()
     angular: RotationLimits = RotationLimits()
-    orientation: Literal["exact", "nearest"] | None = None
+    orientation: Orientation | None = None
     """`exact` refuses a pose whose orientation cannot be reached; `nearest` reaches the position first. By
     default `exact` with six joints or more."""
     posture: Mapping[str, Angle] = {}

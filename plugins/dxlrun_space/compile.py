@@ -6,14 +6,16 @@ import math
 from collections.abc import Collection, Mapping
 
 import msgspec
+from pydantic import ValidationError
 
 from dxlrun.tooling.features import Compilation, CompileStage, Contribution, Row
 from dxlrun.tooling.plans import JointPlan
 from dxlrun_space import form
+from dxlrun_space.cartesian_controller import CartesianController, CartesianParameters
 from dxlrun_space.chain import Chain, WrongChain
 from dxlrun_space.pose_form import chain_of, solve_pose
 from dxlrun_space.reach import dexterity
-from dxlrun_space.solver import CLOSE_RAD
+from dxlrun_space.solver import CLOSE_RAD, Orientation
 
 
 def compile_tip_poses(compilation: Compilation) -> Contribution:
@@ -21,7 +23,7 @@ def compile_tip_poses(compilation: Compilation) -> Contribution:
     file, body, rows = compilation.file, compilation.body, list[Row]()
     joints = {name: joint.plan for name, joint in compilation.joints.items()}
     mistaken = file.robot.joints.keys() - joints.keys()
-    arms = [each for each in file.robot.controllers.values() if each.type == "cartesian_controller"]
+    arms = _arms(compilation)
     written = form.STAGE.section_of(file.robot)
     poses: dict[str, dict[str, float] | None] = dict.fromkeys(written)
     for name, pose in written.items():
@@ -34,9 +36,9 @@ def compile_tip_poses(compilation: Compilation) -> Contribution:
                 file.warning(file.key("tip_poses", name), what, f"run with {omitted} to have it")
                 poses[name] = {}
             elif mistaken.isdisjoint(chain.joints):
-                moving = [each.parameters for each in arms if each.parameters.get("tip") == pose.tip]
-                row = _row(chain, pose, joints, [each.get("orientation") for each in moving])
-                if not moving and row["orientation_error"] > CLOSE_RAD:
+                orientations = [arm.orientation for arm in arms or () if arm.tip == pose.tip]
+                row = _row(chain, pose, joints, orientations)
+                if arms is not None and not orientations and row["orientation_error"] > CLOSE_RAD:
                     off = math.degrees(row["orientation_error"])
                     what = f"pose {name} is {off:.1f} deg from its orientation, which the arm cannot reach"
                     file.warning(file.key("tip_poses", name), what, "give it another orientation")
@@ -47,8 +49,24 @@ def compile_tip_poses(compilation: Compilation) -> Contribution:
     return Contribution(poses=poses, plan=msgspec.json.encode(rows))
 
 
+def _arms(compilation: Compilation) -> list[CartesianParameters] | None:
+    """Return the parameters of all controllers in space; None if some are not valid, which is reported."""
+    found: list[CartesianParameters] = []
+    for entry in compilation.file.robot.controllers.values():
+        offer = compilation.plugins.controllers.get(entry.type)
+        if offer is not None and issubclass(offer.controller, CartesianController):
+            try:
+                found.append(offer.controller.Parameters.model_validate(entry.parameters))
+            except ValidationError:
+                return None
+    return found
+
+
 def _row(
-    chain: Chain, pose: form.TipPose, joints: Mapping[str, JointPlan], orientations: Collection[object]
+    chain: Chain,
+    pose: form.TipPose,
+    joints: Mapping[str, JointPlan],
+    orientations: Collection[Orientation | None],
 ) -> Row:
     """Return the row of a pose with its joints."""
     solver, positions, orientation_error = solve_pose(pose, chain, joints, orientations)

@@ -26,7 +26,10 @@ class TipPose(Form):
     y: _Place = key("Position of the tip.", "0 cm")
     z: _Place = key("Position of the tip.", "15 cm")
     rpy: _Turns | None = key(
-        "Roll, pitch and yaw. Without it any orientation.", "[0 deg, 40 deg, 0 deg]", None
+        "Roll, pitch and yaw. Without it any orientation. Only `dxlrun check` compares it, with the "
+        "controllers of the robot file: goals by name are joints.",
+        "[0 deg, 40 deg, 0 deg]",
+        None,
     )
     quaternion: _Quaternion | None = key("Orientation x, y, z, w in place of `rpy`.", "[0, 0, 0, 1]", None)
     near: dict[Name, Angle] = key(

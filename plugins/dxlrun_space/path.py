@@ -47,7 +47,7 @@ _ROUNDING: Final = 1e-6
 
 
 class MotionLimits(msgspec.Struct, frozen=True):
-    """Limits of a motion: of each joint, rad/s and rad/s^2, and of the tip."""
+    """Limits of a motion, all above 0: of each joint, rad/s and rad/s^2, and of the tip."""
 
     velocity: Positions
     acceleration: Positions
@@ -55,6 +55,12 @@ class MotionLimits(msgspec.Struct, frozen=True):
     linear_acceleration: float  # m/s^2
     angular_velocity: float  # rad/s
     angular_acceleration: float  # rad/s^2
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for a limit with which nothing would move."""
+        first, second, *tip = msgspec.structs.astuple(self)
+        if not all(limit > 0 for limit in (*first, *second, *tip)):
+            raise ValueError(f"limits of a motion must be above 0: {self}")
 
 
 class NoPath(msgspec.Struct, frozen=True):

@@ -11,7 +11,7 @@ from dxlrun.tooling.robots import Urdf, read_urdf
 from dxlrun_space.chain import BASE, Chain, WrongChain
 from dxlrun_space.form import TipPose
 from dxlrun_space.path import out_of_reach, suffices
-from dxlrun_space.solver import Solver, demands_orientation, finish_search
+from dxlrun_space.solver import Orientation, Solver, demands_orientation, finish_search
 
 
 class SolvedPose(NamedTuple):
@@ -24,7 +24,10 @@ class SolvedPose(NamedTuple):
 
 
 def solve_pose(
-    pose: TipPose, chain: Chain, joints: Mapping[str, JointPlan], orientations: Collection[object] = ()
+    pose: TipPose,
+    chain: Chain,
+    joints: Mapping[str, JointPlan],
+    orientations: Collection[Orientation | None] = (),
 ) -> SolvedPose:
     """Return the joints of a chain that have a pose; raise WrongChain if there are none.
 

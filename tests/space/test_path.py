@@ -169,3 +169,12 @@ def test_no_motion_takes_no_time() -> None:
     path = planned(plan_line(arm.solver, start, arm.target(start), limits_of(arm), exact=False))
     assert path.duration_s == 0.0
     assert path.sample(0.0)[0] == pytest.approx(start)
+
+
+@pytest.mark.parametrize("name", MotionLimits.__struct_fields__)
+@pytest.mark.parametrize("limit", [0.0, math.nan])
+def test_limits_that_stop_all_motion_are_refused(name: str, limit: float) -> None:
+    limits = limits_of(all_arms()["koch"])
+    changed = limit if isinstance(getattr(limits, name), float) else (SPEED, limit)
+    with pytest.raises(ValueError, match="limits of a motion must be above 0"):
+        replace(limits, **{name: changed})
