@@ -147,8 +147,9 @@ class TipMotion:
         """Return the speeds of the joints toward the sought positions, and to keep up with these."""
         now, last, rates = self._now, self._now.speeds, self._acceleration
         lag = [*map(sub, before, now.positions)]
-        ways = zip(now.sizes(lag), rates, strict=True)
-        closing = min(approach(way, rate, period_s) / max(way, _LEAST) for way, rate in ways)
+        # A joint that is not behind, with a way of 0, does not hold the others back.
+        ways = ((max(way, _LEAST), rate) for way, rate in zip(now.sizes(lag), rates, strict=True))
+        closing = min(approach(way, rate, period_s) / way for way, rate in ways)
         pairs = zip(before, self._sought, lag, strict=True)
         speeds = [(goal - then) / period_s + closing * way for then, goal, way in pairs]
         sizes = now.sizes(speeds)
@@ -173,7 +174,7 @@ class TipMotion:
         now, solver = self._now, self._solver
         ends = self._left(now.positions, speeds)
         positions = tuple(
-            at + math.copysign(min(abs(speed) * period_s, max(left, 0.0)), speed)
+            at + math.copysign(min(abs(speed) * period_s, left), speed)
             for at, speed, left in zip(now.positions, speeds, ends, strict=True)
         )
         tip = solver.chain.pose(positions)
@@ -204,7 +205,7 @@ class TipMotion:
     def _left(self, positions: Positions, speeds: Sequence[float]) -> list[float]:
         """Return the way of each joint to its limit in the direction in which it moves, rad or m."""
         ends = zip(positions, speeds, self._solver.lower, self._solver.upper, strict=True)
-        return [upper - at if speed > 0 else at - lower for at, speed, lower, upper in ends]
+        return [max(0.0, upper - at if speed > 0 else at - lower) for at, speed, lower, upper in ends]
 
     def _bends(self, speeds: Sequence[float]) -> tuple[float, float]:
         """Return the largest linear and angular acceleration of the tip at constant speeds of the joints.

@@ -410,6 +410,20 @@ def test_all_limits_hold_for_twists_beside_singularities(
     assert rates.max() <= 0.5 * 10
 
 
+@pytest.mark.parametrize(
+    ("joint", "end", "beyond"), [(0, "lower", 0.0), (2, "lower", 0.0), (3, "upper", 0.05)]
+)
+def test_a_joint_at_or_beyond_its_limit_does_not_hold_the_others(joint: int, end: str, beyond: float) -> None:
+    arm, present = all_arms()["open_manipulator_x"], [*READY]
+    present[joint] = getattr(arm, end)[joint] + beyond
+    rows = streamed(staged(present=present), 1.0, vz=0.05)
+    assert_smooth([present, *rows])
+    assert arm.lower[joint] - 1e-3 <= rows[-1][joint] <= arm.upper[joint] + 1e-3
+    way = arm.matrix(rows[-1])[:3, 3] - arm.matrix(present)[:3, 3]
+    assert way[2] > 0.02
+    assert np.abs(way[:2]).max() < 2e-3
+
+
 def test_a_pose_follows_a_twist_and_a_twist_ends_a_pose() -> None:
     stage = staged()
     rows = [*streamed(stage, 0.5, vz=0.1)]
