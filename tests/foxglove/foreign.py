@@ -34,6 +34,8 @@ class ForeignViewer:
             max_size=None,
             max_queue=None,
             ssl=tls,
+            open_timeout=DEADLINE_S,
+            close_timeout=DEADLINE_S,
         )
         self.socket = self._opened.enter_context(asked)
         self.channels: dict[str, dict[str, Any]] = {}
