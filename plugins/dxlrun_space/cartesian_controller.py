@@ -160,6 +160,7 @@ class CartesianController(Controller[CartesianParameters]):
     Parameters = CartesianParameters
     Commands: ClassVar = {"pose": PoseCommand, "twist": TwistCommand, "plan": PoseCommand}
     Goals = frozenset({"pose"})
+    plans = Goals
     Topics: ClassVar = {"plan": PosePlan}
 
     @classmethod

@@ -18,8 +18,8 @@ Angles = Sequence[float | str] | None
 class PoseRefused(Refused):
     """A pose was refused, mostly one out of reach or malformed, or the arm did not reach it.
 
-    `code` is that of the refusal (`invalid`), or the outcome of the goal: `aborted`, `missed`, `cancelled`,
-    `preempted`.
+    `code` is that of the refusal (`invalid`, `goal_refused`), or the outcome of the goal: `aborted`,
+    `missed`, `cancelled`, `preempted`.
     """
 
 

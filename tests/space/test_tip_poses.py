@@ -107,7 +107,7 @@ def test_move_to_waits_for_the_pose_and_raises_what_refused_it(monkeypatch: pyte
         before = robot.states().position.tolist()
         with pytest.raises(PoseRefused, match=r"out of reach; the nearest is \d+\.\d mm away") as refused:
             robot.move_to("arm", x=0.9)
-        assert refused.value.code == "aborted"
+        assert refused.value.code == "goal_refused"
         assert robot.states().position.tolist() == pytest.approx(before, abs=2e-3)
         assert robot.move_to(x=0.2, y=0, z=0.15, quaternion=(0, 0.5, 0, 0.866)).reached
         assert robot.move_to(dz=-0.03, seconds=2.0).seconds == pytest.approx(2.0, abs=0.3)
