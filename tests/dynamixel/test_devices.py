@@ -3,7 +3,7 @@
 import math
 import struct
 from importlib import import_module
-from itertools import count
+from itertools import count, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 from msgspec.structs import replace
-from tests.kit.line_faults import truncate_next
+from tests.kit.line_faults import change_replies, truncate_next
 from tests.kit.plans import make_plan
 from tests.kit.rigs import Rig, make_rig, start_rig
 
@@ -20,6 +20,7 @@ from dxlrun.dynamixel.bus_part import SafeEnd
 from dxlrun.errors import StartUpError
 from dxlrun.features.devices.plan import DeviceCommand
 from dxlrun.features.feature import Feature
+from dxlsim.bus.simulated_bus import PacketFault
 from dxlwire.bus_plan import DevicePlan
 from dxlwire.control_table.device_table import read_device_table
 from dxlwire.plan.device_reads import device_blocks
@@ -174,6 +175,46 @@ def test_a_device_that_answers_only_alone_is_read_alone(monkeypatch, fast):
     assert source == "device_0"
     assert text.endswith("does not answer combined reads; it is read alone from now on")
     assert len(rig.events.of(EventCode.READ_LOST)) <= 2  # its silence may silence the one behind it once
+
+
+def test_a_silent_device_is_probed_by_requests_whose_replies_differ():
+    """A late reply to one is not taken for the reply to the next."""
+    rig = started(("speed",))
+    device(rig).silence()
+    rig.cycle()
+    before = len(rig.into_bus())
+    rig.cycles(20)
+    probes = [packet for packet in rig.into_bus()[before:] if packet[4] == 101]
+    assert len(probes) > 3
+    assert all(one != after for one, after in pairwise(probes))
+
+
+def test_a_device_without_one_of_its_states_stays_lost():
+    rig = started(("led", "speed"), capabilities=NONE)
+    speed = len(protocol2.status_packet(101, 0, bytes(4)))
+    cut = PacketFault("lost", lambda reply: b"" if len(reply) == speed else reply)
+    change_replies(rig.buses[0], lambda servo_id, _: cut if servo_id == 101 else None)
+    cycle_valid(rig, 40)
+    ((_, text),) = rig.events.of(EventCode.DEVICE_LOST)
+    assert "missed" in text
+    assert len(rig.events.of(EventCode.READ_LOST)) == 1
+
+
+def test_a_device_is_inspected_where_its_line_was_lost_while_it_was_probed():
+    rig = started(("speed",))
+    truncate_next(rig.buses[0], 101, 0)
+
+    def replace_adapter_and_device():
+        rig.buses[0].unplug()
+        rig.buses[0].plug_in()
+        poke(rig, "model_number", 5)
+
+    rig.when(lambda data: data[4] == 101, replace_adapter_and_device)
+    rig.cycles(100)
+    assert rig.states.valid.all()
+    assert not rig.sources.valid[0]
+    ((_, text),) = rig.events.of(EventCode.DEVICE_LOST)
+    assert "has model number 5" in text
 
 
 def test_a_device_that_answers_only_between_the_cycles_is_asked_seldom(monkeypatch):
