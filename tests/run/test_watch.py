@@ -119,7 +119,7 @@ def processor(tmp_path):
     return shown
 
 
-def test_a_loop_that_got_no_processor_is_told_from_one_that_hangs(processor):
+def test_a_loop_that_got_no_processor_is_told_from_one_that_hangs(processor, tmp_path):
     processor(100, "R").note_standstill(0)
     processor(110, "R").note_standstill(10 * MS)
     processor(113, "R").note_standstill(20 * MS)
@@ -128,6 +128,13 @@ def test_a_loop_that_got_no_processor_is_told_from_one_that_hangs(processor):
     assert processor(150, "R").starved_ns(80 * MS) is None  # it computes and computes
     assert processor(113, "S").starved_ns(80 * MS) is None  # it waits for what does not come
     assert processor(113, "D").starved_ns(80 * MS) is None
+    processor(200, "R").note_standstill(0)
+    assert processor(200, "R").starved_ns(0) is None
+    processor(300, "R").note_standstill(10 * MS)
+    made = processor(301, "R")
+    assert made.starved_ns(80 * MS) == MS, "each standstill counts from its own begin"
+    (tmp_path / "schedstat").unlink()  # a kernel may have none
+    assert made.starved_ns(80 * MS) is None
 
 
 @pytest.mark.parametrize(
