@@ -1,4 +1,4 @@
-"""C sources of all packages, and the check that they were compiled."""
+"""C sources of the runtime and its libraries, and the check that they were compiled."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SOURCES = tuple(
         "dxlwire/exchange/kernel.c",
     )
 )
-"""Paths of the C files that must be compiled when dxlrun is installed."""
+"""Paths of the C files without which no robot runs."""
 
 
 def missing() -> str:

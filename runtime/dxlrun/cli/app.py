@@ -241,8 +241,9 @@ def _right_form(error: CycloptsError, tokens: Sequence[str]) -> str:
         return _without_options(error, verb, given)
     if {"=", ":="} & set(given) and verb:
         return shlex.join(("dxlrun", *verb, *(word for word in given if word not in ("=", ":="))))
-    if isinstance(error, UnusedCliTokensError) and verb in (["switch"], ["rate"]):
-        words = ["--activate", *given] if verb == ["switch"] else ["".join(given)]
+    is_apart = verb == ["rate"] and len(given) == 2 and given[1].isalpha()  # `rate 50 Hz`
+    if isinstance(error, UnusedCliTokensError) and (verb == ["switch"] or is_apart):
+        words = ["".join(given)] if is_apart else ["--activate", *given]
         return shlex.join(("dxlrun", *verb, *words))
     place = error.argument
     if isinstance(error, MissingArgumentError) and verb and place and place.field_info.is_positional:

@@ -508,8 +508,10 @@ class GatewayApp:
             )
             loaded = self._link.controllers[name]
         elif asked.part() not in self._link.controllers and kind in self._link.controllers:
-            hint = texts.wrong_order(kind, asked.part())
-            raise refused(Code.UNKNOWN_CONTROLLER, {"controller": asked.part()[:80], "hint": hint})
+            name = asked.part()[:80]
+            raise refused(
+                Code.UNKNOWN_CONTROLLER, {"controller": name, "hint": texts.wrong_order(kind, name)}
+            )
         else:
             loaded = self._known(asked)
         units = query.get("units") == "true" and source is None

@@ -63,9 +63,10 @@ def send(
         With --no-wait, return as soon as the controller has accepted the command.
     """
     from dxlrun.channels.answers import Code
-    from dxlrun.cli.steering.written import WrittenEntry, is_apart
+    from dxlrun.cli.steering.written import WrittenEntry
     from dxlrun.description.source_names import SOURCE_COMMANDS
     from dxlrun.description.units import duration
+    from dxlsim.texts.duration import DURATION_NS
 
     if "=" in controller:
         raise InputError(
@@ -74,8 +75,10 @@ def send(
     for_device = "=" in kind
     if for_device:
         words, kind = (kind, *words), SOURCE_COMMANDS
-    if in_ and (unit := next((word for word in words if word[-1:] in "sn" and is_apart(in_, word)), "")):
-        raise InputError(f"{unit!r} is not key=value; write --in {in_}{unit} without the space")
+    # A single word can be the name of a motion or of a pose.
+    units = [word for word in words if word in DURATION_NS] if len(words) > 1 else []
+    if in_ and in_[-1:].isdigit() and units:
+        raise InputError(f"{units[0]!r} is not key=value; write --in {in_}{units[0]} without the space")
     try:
         seconds = None if in_ is None else duration(in_, bare="s") * 1e-9
     except ValueError as error:
@@ -121,11 +124,11 @@ def _with_key(robot: RemoteRobot, controller: str, kind: str, written: WrittenEn
     takes = [one["takes"] for one in listed if one["name"] == controller] if isinstance(listed, list) else []
     if not takes or kind not in takes[0]:
         return {}  # The robot names the unknown controller or command, or the missing joint
-    for key, field in takes[0][kind].get("properties", {}).items():
-        if any(each.get("type") == "string" for each in field.get("anyOf", [field])):
-            return written.with_key(key)
-        break
-    return written.with_key("")
+    fields = takes[0][kind].get("properties", {})
+    first = next(iter(fields), "")
+    field = fields.get(first, {})
+    is_name = any(each.get("type") == "string" for each in field.get("anyOf", [field]))
+    return written.with_key(first if is_name else "")
 
 
 def cancel(goal: str = "", /, *, wait: WaitFlag = False, chosen: RobotChoice = ONLY_ONE) -> int:

@@ -54,13 +54,13 @@ class WrittenEntry:
         if file is not None:
             text, name = read_text(file), str(file)
         else:
-            spaced = next((word for word in words if word[:1] == "=" or word[-1:] == "="), "")
-            if spaced:
-                pair = re.sub(r"\s*=\s*", "=", " ".join(words))
-                raise InputError(f"{spaced!r} is not key=value; write {pair} without spaces at =")
-            for word, unit in pairwise(words):
-                if "=" in word and is_apart(word, unit):
-                    raise InputError(f"{unit!r} is not key=value; write {word}{unit} without the space")
+            for word, after in pairwise(words):
+                if (word[-1:] == "=" and "=" not in after) or (after[:1] == "=" and "=" not in word):
+                    spaced = word if word[-1:] == "=" else after
+                    pair = re.sub(r"\s*=\s*", "=", " ".join(words))
+                    raise InputError(f"{spaced!r} is not key=value; write {pair} without spaces at =")
+                if "=" in word and word[-1:].isdigit() and _UNIT.fullmatch(after):
+                    raise InputError(f"{after!r} is not key=value; write {word}{after} without the space")
             pairs = [pair for word in words for pair in _NEXT_KEY.split(word)]
             if named and pairs and "=" not in pairs[0]:
                 first = pairs.pop(0)
@@ -113,11 +113,6 @@ class WrittenEntry:
             steps = [int(step) if step.isdecimal() else step for step in path.split("/")[1:]]
             found.append(Problem(self.grown.marks.value(*steps), what, fix))
         return InputError(found)
-
-
-def is_apart(number: str, unit: str) -> bool:
-    """Return True if a number and its unit were written as two words."""
-    return number[-1:].isdigit() and _UNIT.fullmatch(unit) is not None
 
 
 def _line(word: str, example: str = _EXAMPLE) -> str:
