@@ -7,7 +7,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from tests.kit.hands import LiveRobot, Screen, written
+from tests.kit.hands import LiveRobot, Screen, plain, written
 from tests.kit.pages import page_text
 
 from dxlrun.description.motion import read_motion
@@ -103,7 +103,7 @@ def test_ctrl_c_and_the_end_of_input_leave_the_file_as_it_was(robot: Path, tmp_p
         screen.sees("its servo is at 180 deg")  # the live line
         screen.types(key)
         assert screen.ended() == 130
-        said = re.sub(r"\x1b\[[\d;]*m|\r", "", screen.text).splitlines()
+        said = plain(screen.text).replace("\r", "").splitlines()
         assert said[-3:] == ["limp now: elbow", "arm.yaml is unchanged", "interrupted"]
     assert robot.read_text() == ROBOT
 

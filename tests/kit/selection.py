@@ -166,7 +166,7 @@ def add_options(parser: pytest.Parser) -> None:
     group.addoption(
         "--changed", metavar="FILE", help="file with the paths that changed: run their long tests"
     )
-    group.addoption("--passed", metavar="FILE", help="leave out tests that FILE has, and add those that pass")
+    group.addoption("--passed", metavar="FILE", help="omit the tests in FILE, and add those that pass")
 
 
 class Selection:

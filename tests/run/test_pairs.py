@@ -83,11 +83,11 @@ class Servos(BusProcess):
         super().__init__((BusConfig("main", 1_000_000, servos),), self.seen)
 
     def instructions(self) -> int:
-        """Return how many came."""
+        """Return the number of instructions that the servos received."""
         return sum(entry.direction == "in" for entry in read_ledger(self.seen))
 
     def torque(self) -> dict[int, tuple[bool, int]]:
-        """Return of each servo that had its torque written whether it is on, and since when, ns."""
+        """Return by servo ID whether torque is on, and since when (ns); only where it was written."""
         found: dict[int, tuple[bool, int]] = {}
         for t_ns, servo, on in torque_changes(read_ledger(self.seen)):
             if found.get(servo, (False, 0))[0] != on:

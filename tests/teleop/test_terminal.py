@@ -1,6 +1,5 @@
 """`dxlrun teleop` at a terminal: keys move the base of teleoperation.md; by Ctrl-C and a kill it holds."""
 
-import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -10,7 +9,7 @@ from typing import Any, cast
 import pytest
 from tests.kit.awaited import until
 from tests.kit.driven import changes
-from tests.kit.hands import CODE, Screen
+from tests.kit.hands import CODE, Screen, plain
 
 from dxlrun import RemoteRobot, connect, running
 from dxlrun.testing import plan_of
@@ -62,7 +61,7 @@ def test_a_base_is_driven_and_holds_when_the_program_is_interrupted_and_when_it_
         screen.sees("base moves")
         screen.types("\x03")
         assert screen.ended() == 0
-        assert re.sub(r"\x1b\[[\d;?]*[a-zA-Z]", "", screen.text).strip().endswith("diff_drive holds")
+        assert plain(screen.text).strip().endswith("diff_drive holds")
         assert screen.echoes()
     until(lambda: speeds() == (0.0, 0.0))
     with Screen(tmp_path, "teleop") as screen:
