@@ -136,7 +136,7 @@ class Steering:
             commands: Commands from the inbox.
 
         Returns:
-            Number of commands that controllers got.
+            Number of commands that were passed to controllers.
         """
         count = 0
         record, manager = self._record, self._manager

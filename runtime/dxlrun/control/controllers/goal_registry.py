@@ -171,7 +171,7 @@ class RunningGoal:
         self.cancelling = False
         """True after a client asked to cancel the goal."""
         self.has_begun = False
-        """True once the goal was neither aborted by `on_goal` nor while its controller planned it."""
+        """True once the controller can no longer refuse the goal: it has planned it, or was deactivated."""
         self.outcome: Outcome | None = None
         """Outcome of the goal; None while it is running."""
         self.progress, self.error, self.joint, self.text = 0.0, math.nan, "", ""

@@ -299,6 +299,7 @@ class ManagedController:
         Its commands are withdrawn. The gate then holds the last goals of the joints.
         """
         if (goal := self.goal) is not None:
+            goal.has_begun = True  # The controller did not refuse the goal.
             goal.end(Outcome.ABORTED, why)
         self.on(event)
 
