@@ -89,8 +89,9 @@ class SpaceRobot(RemoteRobot):
         return state
 
     def _arms(self) -> list[str]:
-        rows = cast("Sequence[Mapping[str, object]]", self.info()["controllers"])
-        return [str(row["name"]) for row in rows if row["type"] == "cartesian_controller"]
+        """Return the names of the controllers that take a pose as a goal."""
+        rows = cast("Sequence[Mapping[str, Sequence[str]]]", self.info()["controllers"])
+        return [str(row["name"]) for row in rows if "pose" in row["goals"]]
 
 
 def connect(robot: str | None = None, client: str | None = None) -> SpaceRobot:
