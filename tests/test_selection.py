@@ -65,7 +65,7 @@ def test_each_worker_begins_with_slow_files_and_ends_with_short_tests() -> None:
         )
         for name in names
     ]
-    dealt = [[item.path.name for item in selection.deal(items, workers)] for workers in (1, 3)]
+    dealt = [[item.path.name for item in selection.deal_tests(items, workers)] for workers in (1, 3)]
     assert " ".join(dealt[0]) == "L1 L1 L2 L1 2 3 4 2 3 4 5 6"
     assert " ".join(dealt[1]) == "L1 2 3 4 L1 L2 2 3 L1 4 5 6"
 

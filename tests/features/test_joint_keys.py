@@ -3,6 +3,7 @@
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from unittest.mock import Mock, call
 
 import numpy as np
 import pytest
@@ -102,6 +103,23 @@ def test_layer_of_a_joint_key_is_above_the_servos_of_couplings():
     built = layers.build(HardwareLayer(None))
     assert type(built).__name__ == "BacklashLayer"
     assert isinstance(built._hardware, JointHardware)
+
+
+def test_layer_forwards_every_call_that_it_does_not_change():
+    below, done, modes = Mock(), Mock(), np.zeros(2, np.uint8)
+    layer = HardwareLayer(below)
+    calls = [
+        call.start(done), call.read_states(), call.write_goals(), call.set_modes(modes),
+        call.write_register(1, "led", 2, done), call.read_register(1, "led", done),
+        call.switch_torque(1, False, done), call.follow_goals([1]), call.reboot_servo(1, done),
+        call.limit_torque(0.5), call.idle(2, 1), call.stop(), call.leave_torque_on(),
+    ]  # fmt: skip
+    found = [getattr(layer, name)(*given) for name, given, _ in calls]
+    assert below.mock_calls == calls
+    assert found == [below.stop.return_value if one == call.stop() else None for one in calls]
+    assert layer.servo_limits is below.servo_limits
+    public = {name for name in vars(HardwareLayer) if not name.startswith("_")}
+    assert public == {"servo_limits", *(name for name, *_ in calls)}
 
 
 def test_check_of_the_feature_names_the_place():

@@ -134,7 +134,7 @@ def long_files() -> Iterator[tuple[str, str]]:
                 yield str(path.relative_to(ROOT)), text
 
 
-def deal(items: Sequence[pytest.Item], workers: int) -> list[pytest.Item]:
+def deal_tests(items: Sequence[pytest.Item], workers: int) -> list[pytest.Item]:
     """Return the tests in an order in which every worker begins with slow files and ends with short tests.
 
     `--dist worksteal` cuts the tests into one stretch a worker, and moves the end of a stretch to an idle
@@ -199,7 +199,7 @@ class Selection:
         left_out = {item for item in items if item.nodeid in self._passed or self._is_needless(item)}
         config.hook.pytest_deselected(items=[*left_out])
         workers = getattr(config, "workerinput", {}).get("workercount", 1)
-        items[:] = deal([item for item in items if item not in left_out], workers)
+        items[:] = deal_tests([item for item in items if item not in left_out], workers)
 
     def _is_needless(self, item: pytest.Item) -> bool:
         affected = str(item.path.relative_to(item.config.rootpath)) in self._affected
