@@ -127,6 +127,13 @@ def test_a_late_cycle_in_a_pause_ends_no_run_and_costs_the_controllers_no_time(l
     assert np.diff(times).tolist() == [PERIOD_NS] * (len(times) - 1)
 
 
+@pytest.mark.parametrize("length", [1, 2, 3])
+def test_a_pause_does_not_change_the_period_of_a_slow_controller(length):
+    left = Left(every=2)
+    left.run(12, {3: left.asks("pause"), 3 + length: left.asks("resume")})
+    assert {*np.diff(left.times("left"))} == {2 * PERIOD_NS}
+
+
 def test_periods_are_skipped_in_a_pause_just_before_the_end_of_the_motions(left):
     left.run(99, {3: left.asks("pause"), 5: left.asks("resume")}, work={3: 5.5}, end_ns=5 * PERIOD_NS)
     assert left.result.reason == "ended"
