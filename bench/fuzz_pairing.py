@@ -40,9 +40,9 @@ EDGES = (-(1 << 63), -1, 0, 1_000_000, (1 << 63) - 1)  # Times, rates and return
 _SANITIZED = "DXLRUN_SANITIZED"  # Environment variable with the sanitized object
 
 
-def random_bytes(chance: random.Random, most: int) -> bytes:
-    """Return up to `most` bytes, many of them of headers."""
-    return bytes(chance.choice((0xFF, 0xFD, 0, 0x55, chance.randrange(256))) for _ in range(most))
+def random_bytes(chance: random.Random, count: int) -> bytes:
+    """Return random bytes, many of them those of headers."""
+    return bytes(chance.choice((0xFF, 0xFD, 0, 0x55, chance.randrange(256))) for _ in range(count))
 
 
 def blocks(chance: random.Random) -> bytes:
@@ -73,7 +73,7 @@ def status(chance: random.Random) -> bytes:
 
 
 def random_packets(chance: random.Random) -> PacketColumns:
-    """Return packets, sorted by bus; times go back at times."""
+    """Return packets, sorted by bus; some times go back."""
     texts, rows, at_ns = [instruction(chance) for _ in range(chance.randint(1, 24))], [], 0
     for _ in range(chance.randrange(60)):
         kind = chance.choice((*PacketKind, PacketKind.INSTRUCTION, PacketKind.STATUS, PacketKind.STATUS))

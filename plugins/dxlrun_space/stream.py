@@ -20,11 +20,11 @@ LEASH_M: Final = 0.02
 LEASH_RAD: Final = 0.1
 """The same of its orientation, rad."""
 _AHEAD: Final = 0.95
-"""Part of the tip's limits within which the pose moves. With the rest the tip catches up with it."""
+"""Part of the tip's limits within which the pose moves. The rest is for the tip to catch up with the pose."""
 _BRAKING: Final = 0.8
 """Part of the acceleration for a planned stop. The rest makes up for the length of a period."""
 _TRIES: Final = 6
-"""Most tries to find the largest share of the planned speeds within the limits, where the rest is braking."""
+"""Most tries to find the largest share of the planned speeds that keeps the limits; the rest is braking."""
 _STILL: Final = 1e-6
 """Speed below which a joint rests, rad/s or m/s."""
 _LEAST: Final = 1e-12

@@ -32,7 +32,7 @@ _SETTLED_PART, _SETTLED_TICKS = 0.02, 2
 _MOVED_TICKS = 4  # Shorter movements give no lag, because positions are quantized in ticks
 _BLOCK = 1 << 16  # Cycles times joints that are processed at once, with eight joints at least
 _LONGEST_REST_S = 20.0  # A longer rest is counted as two
-# Compared with a member of an enumeration, NumPy converts each element to 64 bits.
+# Plain numbers: to compare with a member of an enumeration, NumPy converts each element to 64 bits.
 _GIVEN, _REBOOTING, _LOST = map(int, (Torque.GIVEN, Torque.REBOOTING, Torque.LOST))
 
 Flags = NDArray[np.bool_]

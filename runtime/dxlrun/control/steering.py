@@ -231,7 +231,7 @@ class Steering:
             fields = {"controller": goal.controller, "kind": goal.kind, "problem": goal.text}
             return Refusal(Code.GOAL_REFUSED, {**fields, "goal": goal.number})
         waited_ns = self._schedule.time_ns - goal.accepted_ns
-        if goal.has_begun or goal.outcome is not None or self.paused or waited_ns > LONGEST_PLANNING_NS:
+        if goal.has_begun or goal.outcome is not None or self.paused or waited_ns >= LONGEST_PLANNING_NS:
             return Completion(self._record.cycle, goals=(goal.number,))
         return Acceptance((goal.controller,))
 

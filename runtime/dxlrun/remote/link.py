@@ -43,8 +43,8 @@ KEPT_TEXT = 1 << 20
 LONGEST_DATA = LONGEST_COMMAND - 1024
 """Upper limit of a command's payload, bytes: the longest operation of the mailbox minus room for names."""
 ENTER_S = 6.0
-"""Timeout, s, after the loop replied that servos change their operating mode; the loop's own timeout is 5 s.
-"""
+"""Timeout, s, after the loop replied that servos change their operating mode, or that a goal is planned. The
+loop's own timeouts are 5 s, and a cycle is at most 1 s."""
 # s; polling intervals while a command is pending, and otherwise. The rings have no wake-up.
 _LOOK_S = 0.0005
 _IDLE_LOOK_S = 0.02
