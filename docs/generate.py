@@ -80,9 +80,9 @@ def use_only_this_repository() -> None:
     groups = {point.group for package in packages for point in package.entry_points}
     installed = importlib.metadata.distributions
 
-    def distributions() -> Iterator[Distribution]:
+    def distributions(name: str = "") -> Iterator[Distribution]:
         others = (each for each in installed() if groups.isdisjoint(each.entry_points.groups))
-        return chain(packages, others)
+        return (each for each in chain(packages, others) if name in ("", each.metadata["Name"]))
 
     importlib.metadata.distributions = distributions  # type: ignore[assignment]  # this process only generates
     sys.path[:0] = [str(ROOT / source) for source in SOURCES]

@@ -1,15 +1,16 @@
 """Form of the section `tip_poses` of the robot file."""
 
-from __future__ import annotations
-
-from typing import Annotated, Self
+from typing import TYPE_CHECKING, Annotated, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
 from dxlrun import Angle, Length
 from dxlrun.tooling.features import Section
 from dxlrun.tooling.files import Form, Name, key
-from dxlrun_space.space_goals import PoseCommand, at_most_a_turn, check_turns
+from dxlrun_space.orientation_checks import at_most_a_turn, check_turns
+
+if TYPE_CHECKING:
+    from dxlrun_space.space_goals import PoseCommand
 
 _Place = Annotated[Length, Field(ge=-100, le=100)]  # As in the command `pose`
 _Turn = Annotated[Angle, AfterValidator(at_most_a_turn)]
@@ -41,8 +42,11 @@ class TipPose(Form):
         check_turns(self.quaternion, self.rpy)
         return self
 
-    def as_command(self) -> PoseCommand:
+    def as_command(self) -> "PoseCommand":
         """Return the pose as a command."""
+        # Imported here because every robot file needs this form, and few have a pose of a link.
+        from dxlrun_space.space_goals import PoseCommand
+
         return PoseCommand.model_validate(self.model_dump(include={"x", "y", "z", "rpy", "quaternion"}))
 
 

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Annotated, Final, Literal, Self, TypeVar
+from typing import Annotated, Literal, Self, TypeVar
 
 import numpy as np
 from pydantic import BeforeValidator, Field, TypeAdapter, model_validator
 
 from dxlrun import NAMED_POSE, Angle, AngularVelocity, CommandModel, Floats, Length, LinearVelocity
 from dxlrun.tooling.robots import Transform, from_rpy, product
-from dxlrun_space.chain import Quaternion, Vector
+from dxlrun_space.chain import Vector
+from dxlrun_space.orientation_checks import at_most_a_turn, check_turns
 
-NORM: Final = 1e-3
-"""Largest difference of a quaternion's length from 1: three decimals of each number."""
 C = TypeVar("C", bound=CommandModel)
 
 
@@ -28,23 +27,6 @@ def _rad(value: object) -> object:
     if isinstance(value, str):
         value = 0.0 if value.strip() in ("0", "0.0") else TypeAdapter(Angle).validate_python(value)
     return at_most_a_turn(value) if isinstance(value, int | float) else value
-
-
-def at_most_a_turn(value: float) -> float:
-    """Return an angle, rad; raise ValueError if it is more than a turn."""
-    if abs(value) > 2 * math.pi:
-        raise ValueError(
-            f"{value:g} rad is more than a turn; write at most a turn, with its unit, such as 90deg"
-        )
-    return value
-
-
-def check_turns(quaternion: Quaternion | None, *others: Vector | None) -> None:
-    """Raise ValueError for more than one orientation, or a quaternion that is not of length 1."""
-    if sum(each is not None for each in (quaternion, *others)) > 1:
-        raise ValueError("give only one of rpy, drpy and quaternion; remove the others")
-    if quaternion is not None and abs(math.hypot(*quaternion) - 1) > NORM:
-        raise ValueError(f"the quaternion has length {math.hypot(*quaternion):.4g}; scale it to length 1")
 
 
 def _items(value: object) -> object:

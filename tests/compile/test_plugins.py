@@ -15,7 +15,7 @@ from tests.kit.packages import plugin_folder
 from tests.kit.pages import page_text
 from tests.kit.robots import PAIR, compile_text, problems_in, robot_text
 
-from dxlrun import CommandModel, Controller, Interfaces, ParametersModel
+from dxlrun import CommandModel, Controller, Interfaces, ParametersModel, installed_plugins
 from dxlrun.compile import robot_compiler
 from dxlrun.compile.joints.register_values import UnfitRegister, any_value
 from dxlrun.control.controllers.plugin_loading import Offer, PlugIns, load_plugins
@@ -266,3 +266,18 @@ def test_a_client_may_change_only_ram_of_its_own(name, said):
     assert check_change(table, "position_p_gain", 640).value == 640
     with pytest.raises(ValueError, match=said):
         check_change(table, name, 2)
+
+
+def test_first_package_of_a_name_hides_the_others(tmp_path, monkeypatch):
+    """Only its entry points count, even if it has none of dxlrun."""
+
+    def publishers():
+        return [each.publisher for each in installed_plugins.installed_plugins() if each.name == "waves"]
+
+    for version in ("1.0", "2.0"):
+        (folder := tmp_path / version).mkdir()
+        monkeypatch.syspath_prepend(plugin_folder(folder, "waves", "", "wave-robots", version=version))
+    assert publishers() == ["wave-robots 2.0"]
+    (folder / "wave_robots-2.0.dist-info/entry_points.txt").write_text("[console_scripts]\n")
+    installed_plugins._read.cache_clear()
+    assert publishers() == []

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import signal
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -195,6 +194,9 @@ def pose_text(positions: Mapping[str, str]) -> str:
 @contextmanager
 def terminated_as_interrupted() -> Iterator[None]:
     """Handle SIGTERM like Ctrl-C in the block, so that the results of a measurement are kept and shown."""
+    # Imported here because few commands measure.
+    import signal
+
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         yield

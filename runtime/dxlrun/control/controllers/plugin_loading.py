@@ -28,7 +28,6 @@ from dxlrun.description.base_form import ParametersModel
 from dxlrun.errors import ControllerFault, PlugInError
 from dxlrun.features import FEATURES, broken_features, stages
 from dxlrun.installed_plugins import GROUP, InstalledPlugin, distribution_name, installed_plugins
-from dxlrun.messages.declared import WrongMessage, declared_message
 from dxlrun.plan.loop_plan import ControllerPlan, JointPlan
 from dxlsim.motor_model import MotorModel
 from dxlwire.control_table import add_control_table
@@ -311,10 +310,12 @@ def load_plugins(
     """
     broken: dict[str, str] = {}
     loaded: list[LoadedPlugIn] = []
+    manager = pluggy.PluginManager(GROUP)
+    manager.add_hookspecs(HookSpecs)
     for plugin in sorted(installed_plugins(), key=lambda each: each.publisher):
         named = f"{plugin.name} ({plugin.publisher})"
         try:
-            loaded.append(_load(plugin))
+            loaded.append(_load(plugin, manager))
         except PlugInError as error:
             broken[plugin.name if plugin.name not in broken else named] = str(error)
         after_each(named)
@@ -371,8 +372,11 @@ def _one_line(error: BaseException) -> str:
     return " ".join(f"{type(error).__name__}: {error}".split())
 
 
-def _load(plugin: InstalledPlugin) -> LoadedPlugIn:
-    """Import and check one plug-in. Raises PlugInError with one sentence that names its distribution."""
+def _load(plugin: InstalledPlugin, manager: pluggy.PluginManager) -> LoadedPlugIn:
+    """Import and check one plug-in. Raises PlugInError with one sentence that names its distribution.
+
+    The plug-in is registered with `manager` only in this call, so that each hook is called for it alone.
+    """
     publisher = plugin.publisher
 
     def make_error(what: str, fix: str) -> PlugInError:
@@ -383,19 +387,22 @@ def _load(plugin: InstalledPlugin) -> LoadedPlugIn:
     if unmarked:
         what = f"has an unmarked hook {unmarked[0]}"
         raise make_error(what, "put @dxlrun.hookimpl above this function")
-    manager = pluggy.PluginManager(GROUP)
-    manager.add_hookspecs(HookSpecs)
-    # The errors of pluggy name hooks that do not exist and wrong arguments.
-    _asked(make_error, "has an invalid hook", partial(manager.register, module, plugin.name))
-    _asked(make_error, "has an invalid hook", manager.check_pending)
-    contracts, controllers, servo_models, commands = (
-        _asked(make_error, "raised in a hook", getattr(manager.hook, f"dxlrun_{name}"))
-        for name in ("contract", "controllers", "servo_models", "commands")
-    )
-    offered = {
-        feature.name: (stage, _asked(make_error, "raised in a hook", getattr(manager.hook, stage.hook)))
-        for feature, stage in stages(OfferStage, FEATURES)
-    }
+    try:
+        # The errors of pluggy name hooks that do not exist and wrong arguments.
+        _asked(make_error, "has an invalid hook", partial(manager.register, module, plugin.name))
+        _asked(make_error, "has an invalid hook", manager.check_pending)
+        contracts, controllers, servo_models, commands = (
+            _asked(make_error, "raised in a hook", getattr(manager.hook, f"dxlrun_{name}"))
+            for name in ("contract", "controllers", "servo_models", "commands")
+        )
+        offered = {
+            feature.name: (stage, _asked(make_error, "raised in a hook", getattr(manager.hook, stage.hook)))
+            for feature, stage in stages(OfferStage, FEATURES)
+        }
+        overrun = _overrun(manager)
+    finally:
+        if manager.is_registered(module):
+            manager.unregister(module)
     if not contracts:
         raise make_error("does not declare its contract", "it must implement the hook dxlrun_contract")
     contract = contracts[0]
@@ -411,7 +418,7 @@ def _load(plugin: InstalledPlugin) -> LoadedPlugIn:
         contract,
         dict(_makes(controllers, "dxlrun_controllers", make_error, partial(_offer, publisher, make_error))),
         tuple(name for models in servo_models for name in _add_servo_models(models, make_error)),
-        _overrun(manager),
+        overrun,
         {
             name: dict(
                 _makes(found, stage.hook, make_error, partial(_driver_offer, stage, publisher, make_error))
@@ -563,6 +570,11 @@ def _commands_breach(controller: ControllerClass) -> Breach | None:
 
 
 def _topics_breach(topics: Mapping[str, type]) -> Breach | None:
+    if not topics:
+        return None
+    # Imported here because few controllers publish messages.
+    from dxlrun.messages.declared import WrongMessage, declared_message
+
     for topic, message in topics.items():
         try:
             declared_message(message, "any")

@@ -45,8 +45,10 @@ def with_groups(grown: PlainDocument) -> PlainDocument:
         return _without_defaults(grown, NO_GROUPS)
     groups = _groups(data)
     # Lowest precedence first: defaults, then groups, then the joints' own keys.
-    layers = [_layer(grown, (DEFAULTS,), tuple(_mapping(data.get("joints"))), groups)]
-    layers += [_layer(grown, (GROUPS, name), joints, groups) for name, joints in groups.items()]
+    sources: list[tuple[KeyPath, tuple[str, ...]]] = [((DEFAULTS,), tuple(_mapping(data.get("joints"))))]
+    sources += [((GROUPS, name), joints) for name, joints in groups.items()]
+    of_servos, without_servo = keys_of_servos(), _without_servo(data, groups)
+    layers = [_layer(grown, source, joints, without_servo, of_servos) for source, joints in sources]
     grown = replace(grown, problems=(*grown.problems, *_disagreements(grown, groups, layers[1:])))
     return put_in(merged([*layers, _without_defaults(grown, groups)]), groups)
 
@@ -186,16 +188,28 @@ def _circle(entries: Mapping[str, object], way: tuple[str, ...]) -> tuple[str, .
     return next((circle for circle in below if circle), ())
 
 
-def _layer(grown: PlainDocument, source: KeyPath, joints: tuple[str, ...], groups: Groups) -> PlainDocument:
-    """Return a document that has, for each of these joints, the keys of `joint_defaults` or of a group."""
+def _without_servo(data: Mapping[str, object], groups: Groups) -> frozenset[str]:
+    """Return the joints that sections of features move, which have no servo of their own."""
+    sections = (section for _, section in stages(Section, installed_features()))
+    named = (one for each in sections for one in each.moved_joints(data.get(each.name)))
+    return frozenset(joint for one in named for joint in groups.get(one, (one,)))
+
+
+def _layer(
+    grown: PlainDocument,
+    source: KeyPath,
+    joints: tuple[str, ...],
+    without_servo: frozenset[str],
+    of_servos: frozenset[str],
+) -> PlainDocument:
+    """Return a document that has, for each of these joints, the keys of `joint_defaults` or of a group.
+
+    Joints in `without_servo` do not get the keys in `of_servos`.
+    """
     at: object = grown.data
     for step in source:
         at = _mapping(at).get(str(step))
     given = {key: value for key, value in _mapping(at).items() if key != "joints"}
-    sections = (section for _, section in stages(Section, installed_features()))
-    named = (one for each in sections for one in each.moved_joints(grown.data.get(each.name)))
-    without_servo = {joint for one in named for joint in groups.get(one, (one,))}
-    of_servos = keys_of_servos()
     keys = {
         joint: [key for key in given if joint not in without_servo or key not in of_servos]
         for joint in joints
