@@ -9,8 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Final, NamedTuple
+from typing import Final
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -396,7 +397,7 @@ class Trajectory:
         np.copyto(sample.rows, self._on_piece.evaluate(t - self._begin_s))
 
 
-class SplineLimits(NamedTuple):
+class SplineLimits(msgspec.Struct, frozen=True):
     """Limits of joints on the bridge into a trajectory and in the stop after it, each of shape (joints,)."""
 
     speed: Floats

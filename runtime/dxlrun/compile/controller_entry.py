@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 import msgspec
 from msgspec.structs import replace
@@ -65,7 +65,7 @@ class CompiledController(msgspec.Struct, frozen=True):
     registers: tuple[RegisterChange, ...] = ()  # registers that it may write during a run
 
 
-class PlugInCode(NamedTuple):
+class PlugInCode(msgspec.Struct, frozen=True):
     """Calls into a plug-in's class for one entry; converts any exception of its code into WrongEntry."""
 
     kind: str

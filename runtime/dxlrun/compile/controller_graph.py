@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
-from typing import Literal, NamedTuple, TypeAlias
+from typing import Literal, TypeAlias
 
 import msgspec
 
@@ -36,7 +36,7 @@ class GraphEdge(msgspec.Struct, frozen=True):
     interfaces: tuple[str, ...]
 
 
-class Mistake(NamedTuple):
+class Mistake(msgspec.Struct, frozen=True):
     """A mistake of a controller: path of the key in the robot file, problem, and fix."""
 
     at: KeyPath

@@ -13,8 +13,8 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Sequence, Set
 from types import MappingProxyType
-from typing import NamedTuple
 
+import msgspec
 from msgspec.structs import replace
 
 from dxlwire.bus_plan import SLOW_STATES, Budget, Member, ServoPlan
@@ -28,7 +28,7 @@ TOGETHER = "bulk_read"  # The same capability for servos with different layouts
 FAST = "fast_sync_read"  # Capability to answer with one shared status packet
 
 
-class Reads(NamedTuple):
+class Reads(msgspec.Struct, frozen=True):
     """The read instructions of one bus in a cycle: groups of servos and devices, each with its
     transaction."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_left
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import msgspec
 
@@ -109,7 +109,7 @@ def report_speed(joint: JointPlan, speed: float, where: str, mark: Mark, problem
         problems.warning(mark, excess.text, fix)
 
 
-class ExcessSpeed(NamedTuple):
+class ExcessSpeed(msgspec.Struct, frozen=True):
     """Explanation that a requested speed is above the highest speed of a joint, with the fix."""
 
     text: str
@@ -171,7 +171,7 @@ def _worst(
     return farthest, fastest
 
 
-class LimitViolation(NamedTuple):
+class LimitViolation(msgspec.Struct, frozen=True):
     """Message for one value of a command that is beyond a limit of its joint."""
 
     joint: str

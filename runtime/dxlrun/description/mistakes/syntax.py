@@ -9,7 +9,8 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from itertools import accumulate
-from typing import NamedTuple
+
+import msgspec
 
 from dxlrun.errors import Mark, Problem
 
@@ -32,7 +33,7 @@ class _OpenQuoteError(Exception):
     """Raised if a quote is not closed, so that brackets after it cannot be judged."""
 
 
-class _Bracket(NamedTuple):
+class _Bracket(msgspec.Struct, frozen=True):
     """An open bracket: its line and column, counted from 0, and the indentation of its line."""
 
     character: str

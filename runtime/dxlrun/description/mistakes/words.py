@@ -11,7 +11,6 @@ import tomllib
 from collections.abc import Callable, Collection, Iterator, Mapping
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple
 
 import msgspec
 from pydantic import BaseModel
@@ -49,7 +48,7 @@ _NEEDLESS = {
 """Values of a joint's needless keys `type` and `mode`, each with the fix."""
 
 
-class Remedy(NamedTuple):
+class Remedy(msgspec.Struct, frozen=True):
     """Fix for one unknown key, or for two unknown keys (such as lower and upper) that mean one key."""
 
     keys: tuple[str, ...]
@@ -58,7 +57,7 @@ class Remedy(NamedTuple):
     """Key that was meant; it is then not reported as missing."""
 
 
-class _Meaning(NamedTuple):
+class _Meaning(msgspec.Struct, frozen=True):
     """Key that a foreign term means, and how to convert its value: a key of `_CONVERSIONS`."""
 
     place: Place
