@@ -143,6 +143,17 @@ def test_commands_come_at_the_first_cycle_that_is_not_too_early(robot):
     assert robot.column("command_count") == [0, 1, 1, 0]
 
 
+def test_a_command_of_a_motion_to_a_controller_that_is_not_active_is_refused(robot):
+    robot.script("asleep", active=False).send(0, "asleep", "go")
+    robot.run(2)
+    ((source, text),) = robot.events.of(EventCode.COMMAND_REFUSED)
+    assert (source, text.partition(";")[0]) == (
+        "asleep",
+        "go from motion.yaml:7:5 refused: asleep is not active",
+    )
+    assert robot.column("command_count") == [0, 0]
+
+
 def test_a_controller_is_updated_at_its_own_rate_with_its_true_period_at_most_five_nominal_ones(robot):
     robot.script("slow", every=3, joints=("j0",)).script("patient", joints=("j1",))
     robot.run(work={4: 3.5, 15: 50.0}, end_ns=80 * PERIOD_NS)
