@@ -427,19 +427,20 @@ def servo_action(name: str, *values: Any) -> Callable[[Story, str], None]:
 
 
 def play(story: Story, text: str) -> None:
-    """Request a motion: `leg go 0=0.1 0.1=0.2 until 0.3, arm move 0=5`; a value may be missing."""
+    """Request a motion: `leg go 0=0.1 0.1=0.2 until 0.3, arm move 0=5/3`; a value may be missing."""
     parts, values = [], []
     for part in text.split(", "):
         points, _, end_s = part.partition(" until ")
         controller, kind, *pairs = points.split()
         times = [float(pair.partition("=")[0]) for pair in pairs]
-        values += [float(value) for pair in pairs if (value := pair.partition("=")[2])]
+        given = [pair.partition("=")[2].split("/") for pair in pairs]
+        values += [float(value) for one in given for value in one if value]
         parts.append(
             {
                 "controller": controller,
                 "kind": kind,
                 "at_ns": [round(at_s * 1e9) for at_s in times],
-                "sizes": [1] * len(times),
+                "sizes": [*map(len, given)],
                 "end_ns": round(float(end_s or 0) * 1e9),
             }
         )

@@ -25,7 +25,6 @@ from dxlrun.channels.loop_requests import (
     TorqueRequest,
     Unload,
 )
-from dxlrun.contract.controller import Outcome
 from dxlrun.control import texts
 from dxlrun.control.anchoring import Anchoring
 from dxlrun.control.context import ControlContext
@@ -227,9 +226,8 @@ class Steering:
 
         A pause stops the planning, so it is not awaited.
         """
-        if goal.outcome is Outcome.ABORTED and not goal.has_begun:
-            fields = {"controller": goal.controller, "kind": goal.kind, "problem": goal.text}
-            return Refusal(Code.GOAL_REFUSED, {**fields, "goal": goal.number})
+        if (refusal := goal.refusal) is not None:
+            return refusal
         waited_ns = self._schedule.time_ns - goal.accepted_ns
         if goal.has_begun or goal.outcome is not None or self.paused or waited_ns >= LONGEST_PLANNING_NS:
             return Completion(self._record.cycle, goals=(goal.number,))

@@ -184,6 +184,14 @@ class RunningGoal:
         self._reported_ns = -FEEDBACK_NS
 
     @property
+    def refusal(self) -> Refusal | None:
+        """Refusal of the goal's command if the controller aborted the goal before it began; else None."""
+        if self.outcome is not Outcome.ABORTED or self.has_begun:
+            return None
+        fields = {"controller": self.controller, "kind": self.kind, "problem": self.text}
+        return Refusal(Code.GOAL_REFUSED, {**fields, "goal": self.number})
+
+    @property
     def is_judged(self) -> bool:
         """True from the end of the motion to the end of the goal, while the runtime decides the outcome."""
         return self.judgement is not None

@@ -457,6 +457,8 @@ class Manager:
         for part in parts:
             own, commands = commands[: len(part.sizes)], commands[len(part.sizes) :]
             found = self._begin_part(part, tuple(own), origin)
+            if isinstance(found, RunningGoal):
+                found = found.refusal or found
             if isinstance(found, Refusal):
                 for number in begun:
                     self.cancel_goal(number, "")
