@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ast
 import math
+import re
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Literal
@@ -47,6 +48,10 @@ FUNCTIONS: Mapping[str, Callable[..., float]] = {
     "min": min,
     "max": max,
 }
+
+_IN_SI = {"deg": " * pi / 180", "rad": "", "mm": " / 1000", "cm": " / 100", "m": "", "ms": " / 1000", "s": ""}
+_QUANTITY = re.compile(rf"([\d.]+) *({'|'.join(_IN_SI)})\b")
+"""A number with a unit, which other values of a motion have but formulas have not."""
 
 _NODES = (ast.BinOp, ast.UnaryOp, ast.Constant, ast.Name, ast.Load, ast.Call)
 
@@ -228,6 +233,10 @@ def _parse(text: str) -> ast.expr:
             warnings.simplefilter("ignore")  # Python warns of "2(t)", which is refused below
             tree = ast.parse(text.strip(), mode="eval").body
     except (SyntaxError, ValueError, RecursionError, MemoryError):
+        if quantity := _QUANTITY.search(text):
+            raise ValueError(
+                f"a formula has no units; write {quantity[1]}{_IN_SI[quantity[2]]} for {quantity[0]}"
+            ) from None
         raise ValueError("it is not an expression, or a bracket or sign is missing") from None
     if _depth(tree) > DEEPEST_FORMULA:
         raise ValueError(f"more than {DEEPEST_FORMULA} operations are nested; group long sums")

@@ -133,9 +133,8 @@ def _refuse_other_files(source: Source) -> None:
 
 def _refuse_misplaced_sections(grown: PlainDocument) -> None:
     """Raise InputError for sections that are misnamed or indented too far, before the rest is checked."""
-    own = {key: value for key, value in grown.data.items() if key not in Robot.read_before}
     problems: dict[str, Problem] = {}
-    for path, fix in misplaced_sections(robot_form(), own):
+    for path, fix in misplaced_sections(robot_form(), grown.data):
         what = f"{path_text(path[:-1])} has an unknown key {path[-1]!r}"
         problems.setdefault(fix, Problem(grown.marks.key(*path), what, fix))
     if problems:

@@ -116,11 +116,15 @@ class _Places:
 
 
 def _groups(data: Mapping[str, object]) -> dict[str, tuple[str, ...]]:
-    """Return the joints of each group, with those of groups in it; malformed entries are skipped."""
+    """Return the joints of each group, with those of groups in it; malformed entries are skipped.
+
+    So is a group without a known joint: a list that names it must not become empty.
+    """
     joints, entries = _mapping(data.get("joints")), _named(data)
     return {
-        name: tuple(dict.fromkeys(one for one in _members(entries, name) if one in joints))
+        name: members
         for name in entries
+        if (members := tuple(dict.fromkeys(one for one in _members(entries, name) if one in joints)))
     }
 
 

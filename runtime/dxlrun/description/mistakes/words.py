@@ -236,8 +236,16 @@ def misplaced_sections(
     root: type[BaseModel], data: Mapping[str, object]
 ) -> Iterator[tuple[tuple[str, ...], str]]:
     """Yield path and fix of each section of a robot file that is misnamed or indented too far."""
+    early = getattr(root, "read_before", ())
+    absent = [name for name in (*root.model_fields, *early) if name not in data]
     context = UnknownKeyContext(root, root, (), [*root.model_fields], [*data], {})
     for key, value in data.items():
+        if key in early:
+            continue
+        if key not in root.model_fields and isinstance(value, dict) and near(key, absent):
+            # Its name counts more than its entries: `joints_default` has the keys of a joint.
+            yield (key,), suggestion(key, absent)
+            continue
         inner = value if isinstance(value, dict) else {}
         own = [name for name in inner if name in root.model_fields and name not in data]
         if key not in root.model_fields and len(own) > 1:
