@@ -25,7 +25,7 @@ EXAMPLES = re.findall(r"^```yaml\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
 TABLES = set(re.findall(r"^<!-- keys: (\w+) -->$", PAGE, re.MULTILINE))
 """Sections whose tables docs/generate.py writes."""
 WITHOUT_TABLE = {
-    "Argument", "BareJoint", "Formula", "Group", "LoadForm", "MotionForm", "MotorForm", "PlugInEntry",
+    "Argument", "BareJoint", "Formula", "Group", "JointForm", "LoadForm", "MotionForm", "MotorForm", "PlugInEntry",
     "Point", "Processes", "Robot", "ServoEntry", "ServoJoint", "SharedJoint", "StribeckForm", "Target",
     "UncertaintyForm",
 }  # fmt: skip
