@@ -43,6 +43,13 @@ def test_nothing_to_do_shows_ten_commands_and_is_wrong_input(dxlrun: Dxlrun) -> 
     )
 
 
+def test_option_without_its_value_is_not_reported_as_absent(dxlrun: Dxlrun) -> None:
+    said = dxlrun("send", "arm", "position", "elbow=20deg", "--in")
+    assert said.errors == [
+        'dxlrun: Command "send" parameter --in requires an argument; `dxlrun send --help` shows the usage'
+    ]
+
+
 def test_value_may_hold_the_sign() -> None:
     assert inputs.parse_assignments(["port:=a:=b"]) == {"port": "a:=b"}
 

@@ -325,6 +325,13 @@ def _usage_error(error: CycloptsError, tokens: Sequence[str]) -> str:
             return f"{option} is {new} now; {fix}"
         if meant := near(option.lstrip("-"), long) or short:
             fix = f"did you mean {' or '.join(f'--{name}' for name in meant)}?"
+    # With a keyword the option is there, but not its value.
+    if isinstance(error, MissingArgumentError) and error.argument is not None and error.keyword is None:
+        name = error.argument.name
+        chain = error.command_chain or ()
+        what = f"`{' '.join(('dxlrun', *chain))}` lacks {name if name[:1] == '-' else name.upper()}"
+        if examples := verb_registry.examples_of(chain):
+            fix = f"write for example `{examples[0]}`"
     if line := _right_form(error, tokens):
         fix = f"write `{line}`"
     return f"{what}; {fix}"

@@ -7,11 +7,9 @@ from pathlib import Path
 from dxlrun.cli.app import build
 from dxlrun.cli.help import print_help
 from dxlrun.cli.inputs import known_file
+from dxlrun.cli.verb_registry import examples_of
 from dxlrun.errors import InputError
 from dxlrun.output.terminal import show_parts
-
-EXAMPLES = Path(__file__).with_name("examples.txt")
-"""File with example command lines, one a line; a test parses them."""
 
 
 def show_help(*verb: str) -> int:
@@ -32,7 +30,6 @@ def show_help(*verb: str) -> int:
     if unknown or not chain:
         raise InputError(f"there is no command {' '.join(verb)}; `dxlrun help` lists all of them")
     app.help_print(list(verb))
-    words = ["dxlrun", *verb]
-    examples = [line for line in EXAMPLES.read_text().splitlines() if line.split()[: len(words)] == words]
+    examples = examples_of(verb)
     show_parts(*["", "Examples", *examples] if examples else ())
     return 0

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
 from itertools import chain
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dxlrun.errors import InputError
@@ -16,6 +17,9 @@ from dxlrun.installed_plugins import InstalledPlugin, installed_plugins
 
 if TYPE_CHECKING:
     from dxlrun.contract.hookspecs import Command
+
+EXAMPLES = Path(__file__).with_name("examples.txt")
+"""File with example command lines, one a line; a test parses them."""
 
 EVERY_DAY = "Every day"
 _CLI, _STEERING, _TOOLS = "dxlrun.cli", "dxlrun.cli.steering", "dxlrun.cli.tools"
@@ -151,6 +155,12 @@ def is_importable(command: Command) -> bool:
 def names() -> list[str]:
     """Return the verbs of core and installed packages in alphabetical order."""
     return sorted({*chain(*GROUPS.values()), *packaged()})
+
+
+def examples_of(verb: Sequence[str]) -> list[str]:
+    """Return the example command lines of a command; empty without one."""
+    words = ["dxlrun", *verb]
+    return [line for line in EXAMPLES.read_text().splitlines() if line.split()[: len(words)] == words]
 
 
 def require_package(verb: str) -> None:
