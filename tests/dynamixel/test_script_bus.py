@@ -553,6 +553,29 @@ def test_threads_share_a_bus_and_the_event_loop_waits_for_real_lines():
         assert asyncio.run(work())
     with pytest.raises(ValueError, match=r"protocol 3 is unknown; use 1.0 or 2.0"):
         Bus("/dev/null", protocol=3)
+    with pytest.raises(ValueError, match="baud rate '57600' is not a whole number; use such as 57_600"):
+        Bus("/dev/null", "57600")
+
+
+@pytest.mark.parametrize(
+    ("named", "words"),
+    [
+        ([1, 2], "give each ID its model, such as {1: 'XM430-W350'}; `scan` finds both"),
+        (1, "give each ID its model"),
+        ({"1": "XM430-W350"}, "ID '1' does not exist; IDs are 0 to 252"),
+        ({}, "name at least one servo"),
+    ],
+)
+def test_servos_without_ids_and_models_are_refused_before_a_byte_is_sent(script, named, words):
+    script.sent()
+    with pytest.raises(ValueError, match=words):
+        script.bus.servos(named)
+    assert script.sent() == []
+
+
+def test_servo_of_a_set_is_selected_by_its_id(script):
+    with pytest.raises(LookupError, match=r"no servo with ID 'led' here; there are \[1, 2, 3\]"):
+        script.bus.scan()["led"]
 
 
 @pytest.mark.parametrize(

@@ -55,10 +55,10 @@ class ServoGroup:
         Raises:
             LookupError: The group has no servo with one of these IDs.
         """
-        ids = [ids] if isinstance(ids, SupportsIndex) else ids
+        ids = [ids] if isinstance(ids, SupportsIndex | str) else ids
         known = {servo.servo_id: servo for servo in self.servos}
         if unknown := [each for each in ids if each not in known]:
-            raise LookupError(f"no servo with ID {unknown[0]} here; there are {list(known)}")
+            raise LookupError(f"no servo with ID {unknown[0]!r} here; there are {list(known)}")
         return ServoGroup(self.session, [known[each] for each in ids])
 
     def read_values(self, item: str, *, raw: bool) -> Program[tuple[Floats, Failures]]:
@@ -158,12 +158,17 @@ def named_servos(
 
     Raises:
         LookupError: A model is unknown in this protocol.
-        ValueError: No servo is named, or an ID does not exist in the protocol.
+        ValueError: No servo is named, one has no model, or an ID does not exist in the protocol.
     """
     if not models:
         raise ValueError("name at least one servo")
-    for servo_id in models:
-        if not 0 <= servo_id <= session.line.dialect.HIGHEST_ID:
-            raise ValueError(f"ID {servo_id} does not exist; IDs are 0 to {session.line.dialect.HIGHEST_ID}")
+    try:
+        named = dict(models)
+    except (TypeError, ValueError):
+        raise ValueError("give each ID its model, such as {1: 'XM430-W350'}; `scan` finds both") from None
+    highest = session.line.dialect.HIGHEST_ID
+    for servo_id in named:
+        if servo_id not in range(highest + 1):
+            raise ValueError(f"ID {servo_id!r} does not exist; IDs are 0 to {highest}")
     protocol = session.plan.protocol
-    return identify(session.line, {each: find_table(model, protocol) for each, model in models.items()})
+    return identify(session.line, {each: find_table(model, protocol) for each, model in named.items()})
