@@ -85,6 +85,20 @@ def test_one_bus_has_the_link_and_several_have_its_name_and_theirs(tmp_path: Pat
         link_of_each([BUS], tmp_path / "file")
 
 
+def test_link_of_a_simulation_that_runs_is_not_taken_over(tmp_path: Path) -> None:
+    """A simulation whose link another one took over, and removed at its end, was out of reach."""
+    link, (terminal, device) = tmp_path / "robot", os.openpty()
+    link.symlink_to(os.ttyname(device))
+    try:
+        with pytest.raises(InputError, match="leads to a simulation that runs; end that one"):
+            link_of_each([BUS], link)
+        os.utime(link, (0, 0), follow_symlinks=False)  # the terminal is younger than the link
+        assert link_of_each([BUS], link) == {"main": link}
+    finally:
+        os.close(terminal)
+        os.close(device)
+
+
 def test_ports_are_printed_once(capsys: pytest.CaptureFixture[str]) -> None:
     servos = tuple(ServoConfig(each, "AX-12A", 0.0) for each in (1, 2, 3, 7))
     link = Path("/tmp/robot")  # noqa: S108

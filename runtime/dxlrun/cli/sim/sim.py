@@ -265,7 +265,8 @@ def link_of_each(buses: Sequence[BusConfig], link: Path | None) -> dict[str, Pat
     """Return the path of the symbolic link to each bus' port: LINK for one bus, LINK.NAME for several; empty
     without.
 
-    Raises InputError when a path exists and is not a link, or a link cannot be made.
+    Raises InputError when a path exists and is not a link, when it leads to a simulation that runs, or when a
+    link cannot be made.
     """
     if link is None:
         return {}
@@ -279,9 +280,27 @@ def link_of_each(buses: Sequence[BusConfig], link: Path | None) -> dict[str, Pat
         for path in links.values()
         if path.exists() and not path.is_symlink()
     ]
+    wrong += [
+        f"--link {path} leads to a simulation that runs; end that one, or choose another --link"
+        for path in links.values()
+        if _is_served(path)
+    ]
     if wrong:
         raise InputError("\n".join(wrong))
     return {name: path.absolute() for name, path in links.items()}
+
+
+def _is_served(link: Path) -> bool:
+    """Return True if a link leads to the pseudo-terminal for which it was made.
+
+    A terminal that is younger than the link got its name after the simulation was killed.
+    """
+    try:
+        is_terminal = link.readlink().is_relative_to("/dev/pts")
+        # The ctime of a terminal changes with its owner and mode, not with its data.
+        return is_terminal and link.stat().st_ctime_ns <= link.lstat().st_mtime_ns
+    except OSError:
+        return False
 
 
 def _serve(job: SimulationJob, shown: SimulationView, *, as_json: bool) -> SimulationResult:
