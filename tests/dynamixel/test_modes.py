@@ -234,7 +234,7 @@ def test_a_servo_whose_torque_could_not_be_read_after_a_change_gets_no_goal_unti
 @pytest.mark.parametrize(("model", "protocol"), [("XM430-W350", 2.0), ("AX-12A", 1.0)])
 def test_a_servo_that_reboots_in_its_own_mode_change_gets_no_torque_by_that(model, protocol):
     """Before each packet of the change; the policy for returned servos is limp."""
-    rebooted = []
+    rebooted, given = [], []
     for number in range(1, 60):
         rig = make_one(model, protocol)
         servo = rig.servo(1)
@@ -244,6 +244,7 @@ def test_a_servo_that_reboots_in_its_own_mode_change_gets_no_torque_by_that(mode
             if rig.states.mode[0] == Mode.UNKNOWN:
                 rebooted.append(number)
                 servo.cut_power(rig.clock.now_ns() + 1)
+                given.append(rig.torque_given(1))
 
         rig.buses[0].after(number, reset)
         rig.cycles(40)
@@ -251,6 +252,7 @@ def test_a_servo_that_reboots_in_its_own_mode_change_gets_no_torque_by_that(mode
             break
         assert not servo.torque_on, number
     assert len(rebooted) > 10
+    assert sum(map(any, given)) <= 2, "it gets torque only where it reboots after the last check before that"
 
 
 # Limits of the torque
