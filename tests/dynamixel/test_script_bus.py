@@ -553,7 +553,7 @@ def test_threads_share_a_bus_and_the_event_loop_waits_for_real_lines():
         assert asyncio.run(work())
     with pytest.raises(ValueError, match=r"protocol 3 is unknown; use 1.0 or 2.0"):
         Bus("/dev/null", protocol=3)
-    with pytest.raises(ValueError, match="baud rate '57600' is not a whole number; use such as 57_600"):
+    with pytest.raises(ValueError, match="baud rate '57600' is not an integer; write for example 57_600"):
         Bus("/dev/null", "57600")
 
 

@@ -254,14 +254,14 @@ def open_session(path: str, baud_rate: int, protocol: float) -> Session | SdkSes
 
     Raises:
         PortError: The port cannot be opened, or the adapter does not support the baud rate.
-        ValueError: The protocol is unknown, or the baud rate is not a whole number.
+        ValueError: The protocol is unknown, or the baud rate is not an integer.
     """
     if protocol not in (1.0, 2.0):
         raise ValueError(f"protocol {protocol} is unknown; use 1.0 or 2.0")
     try:
         baud_rate = operator.index(baud_rate)
     except TypeError:
-        raise ValueError(f"baud rate {baud_rate!r} is not a whole number; use such as 57_600") from None
+        raise ValueError(f"baud rate {baud_rate!r} is not an integer; write for example 57_600") from None
     if sys.platform != "linux" or not _is_compiled():
         return SdkSession(path, baud_rate, protocol)
     serial = open_serial(path, baud_rate)
