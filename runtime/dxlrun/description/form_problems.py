@@ -501,6 +501,8 @@ def _sentence_length(error: _Error) -> tuple[str, str]:
     least, most = error.context.get("min_length"), error.context.get("max_length")
     if error.kind in ("too_long", "string_too_long"):
         counted = "entries" if error.kind == "too_long" else "characters"
+        if isinstance(error.input, list) and {int, str} == {type(one) for one in error.input}:
+            return f"{error.path_name} is too long", "write a point instead of each decimal comma"
         return f"{error.path_name} is too long", f"write at most {most} {counted}"
     if error.kind == "string_too_short":
         return f"{error.path_name} is too short", "write something"

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from functools import cache
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal, get_args
 
 from pydantic import (
     AfterValidator,
@@ -27,6 +27,7 @@ from dxlrun.description.units import (
     Rate,
     Share,
 )
+from dxlrun.errors import suggestion
 from dxlrun.features import installed_features, stages
 from dxlrun.features.feature import PolicyKey, Section
 
@@ -124,6 +125,17 @@ class TorqueStep(Form):
 Word = Literal["limp", "hold"]  # torque off; or torque on, every joint holding its position
 
 
+def _step_word(value: object) -> object:
+    """Refuse a text that is not `limp` or `hold`, such as the name of a pose, which needs a speed."""
+    if isinstance(value, str) and value not in get_args(Word):
+        steps = f"write limp, hold, or steps such as [{{pose: {value}, speed: 60 deg/s}}, limp]"
+        raise ValueError(f"{value!r} is not a step; {suggestion(value, get_args(Word), steps)}")
+    return value
+
+
+StepWord = Annotated[Word, BeforeValidator(_step_word, json_schema_input_type=Word)]
+
+
 def _kind_of_step(step: object) -> str:
     if isinstance(step, dict):
         return "<torque>" if "reduce_torque" in step else "<pose>"
@@ -137,13 +149,13 @@ def _kind_of_policy(policy: object) -> str:
 
 
 PolicyStep = Annotated[
-    Annotated[Word, Tag("<word>")]
+    Annotated[StepWord, Tag("<word>")]
     | Annotated[PoseStep, Tag("<pose>")]
     | Annotated[TorqueStep, Tag("<torque>")],
     Discriminator(_kind_of_step),
 ]
 WrittenPolicy = Annotated[
-    Annotated[Word, Tag("<word>")]
+    Annotated[StepWord, Tag("<word>")]
     | Annotated[tuple[PolicyStep, ...], Field(strict=False, min_length=1), Tag("<steps>")],
     Discriminator(_kind_of_policy),
 ]

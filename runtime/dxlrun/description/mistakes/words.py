@@ -194,8 +194,11 @@ class UnknownKeyContext(msgspec.Struct, frozen=True):
         """Return the fix for text that is not a key, such as `rate=50`; empty if it may be one."""
         word, sign, rest = (part.strip() for part in re.split(r"([:=]|$)", key, maxsplit=1))
         named = f"remove it: the entry already has the name {self.path[1]}" if len(self.path) == 2 else ""
-        if key.endswith((")", "]")) and value is None:
+        is_joint = self.path[:1] == ("controllers",) and key in self.sections.get("joints", ())
+        if (key.endswith((")", "]")) or is_joint) and value is None:
             fix = "write a list in square brackets: [a, b]"
+        elif re.match(r"\d+ *[a-z%]", key) and value is None:
+            fix = f"write a point instead of the decimal comma, such as 1.{key}"
         elif sign and word in self.known and value is None:
             how = "write a space after the colon" if sign == ":" else "write a colon instead of ="
             fix = f"{how}: `{word}: {rest}`"
