@@ -83,6 +83,8 @@ class ServoSetup:
             try:
                 with lines.open_line(plan.name) as tool:
                     found = self._alone(tool, plan, servo)
+                    if not self._is_another(plan, found):
+                        continue
                     if name in self._unknown:
                         self._models[name] = found.model
                         self.plans = compile_robot(self.description, [], models=self._models).plan.buses
@@ -96,6 +98,18 @@ class ServoSetup:
                 continue
             self.changing = ""
             return True
+
+    def _is_another(self, plan: BusPlan, found: FoundServo) -> bool:
+        """Return False if a servo was set up before, and the user forgot to exchange it for the next one.
+
+        Only the user knows: a new servo may have the ID and the rate of one that is set up.
+        """
+        before = (servo for servo in plan.servos if servo.own_name in self.done)
+        names = [servo.own_name for servo in before if servo.servo_id == found.servo_id]
+        if not names or found.baud_rate != plan.baud_rate:
+            return True
+        what = f"ID {found.servo_id} is that of {names[0]}, which was set up before. Is this another servo?"
+        return yes(self.dialogue, what)
 
     def _clear_offset(self, one: OneServo, servo: ServoPlan) -> list[str]:
         """Write Homing Offset 0 if the user agrees; the robot file of `servo` does not mention the offset."""
