@@ -79,7 +79,7 @@ class HandJoint:
         search = Search((plan.protocol,), (plan.baud_rate,), (servo.servo_id,))
         found = find_servo(tool, servo.servo_id, search)
         if not found:
-            remedy = choose_remedy(plan.port)
+            remedy = choose_remedy(plan.port, "check power, cable, and ID", simulated="check its ID")
             raise ServoFault(f"{self._label} does not answer at {plan.baud_rate} bit/s; {remedy}")
         self._one = OneServo(tool, found[0])
         self.table: ControlTable = self._one.table

@@ -426,7 +426,7 @@ def _remedy(error: _Error) -> str:
     expected = _TYPES.get(error.kind, "")
     if expected == "a list" and isinstance(error.input, str) and (items := list_text(error.input)):
         return f"write `{error.path[-1] if error.path else 'LIST'}: {items}`"
-    if expected == "a mapping" and (fix := _indentation(error)):
+    if expected in ("a mapping", "a list") and (fix := _indentation(error)):
         return fix
     if error.kind in ("literal_error", "enum"):
         return "write one of them"
@@ -449,7 +449,9 @@ def _is_key_of_entry(error: _Error) -> bool:
 
 
 def _indentation(error: _Error) -> str:
-    """Return the fix for a mapping that is indented wrongly or is a list; empty if it is neither."""
+    """Return the fix for a mapping that is indented wrongly or is a list, or the opposite; else empty."""
+    if isinstance(error.input, dict) and (error.example or "[{").startswith("[{"):
+        return "write `- ` before each entry, or [{...}] around it"
     if error.unindented:
         *others, last = error.unindented
         named = f"{', '.join(others)} and {last}" if others else last
