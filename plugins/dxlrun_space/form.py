@@ -27,8 +27,9 @@ class TipPose(Form):
     y: _Place = key("Position of the tip.", "0 cm")
     z: _Place = key("Position of the tip.", "15 cm")
     rpy: _Turns | None = key(
-        "Roll, pitch and yaw. Without it any orientation. Only `dxlrun check` compares it, with the "
-        "controllers of the robot file: goals by name are joints.",
+        "Roll, pitch and yaw. Without it any orientation. `dxlrun check` compares it with what the "
+        "controllers of the robot file need; a running robot moves to the joints of the pose, and compares "
+        "nothing.",
         "[0 deg, 40 deg, 0 deg]",
         None,
     )
