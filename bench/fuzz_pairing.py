@@ -11,33 +11,27 @@ CI runs a seeded sample of it (tests/analysis/test_exchanges.py).
 from __future__ import annotations
 
 import argparse
-import os
 import random
-import subprocess
 import sys
-import tempfile
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from bench.sanitizers import compile_sanitized, sanitizing_environment
+from bench.sanitizers import load_sanitized, run_sanitized
 
 from dxlrun.channels.logged_packets import LoggedPacket
 from dxlrun.log.columns import PacketColumns
 from dxlrun_analysis.plan_excerpt import LoggedBus
 from dxlrun_analysis.servos import compiled_pairing
 from dxlrun_analysis.servos.exchanges import Pairing
-from dxlwire.compiled import load_compiled
 from dxlwire.packets import PacketKind
 
 IDS = (0, 1, 2, 3, 253, 254, 255)
 SIZES = (0, 1, 4)
 BUSES = 2
 EDGES = (-(1 << 63), -1, 0, 1_000_000, (1 << 63) - 1)  # Times, rates and return delays
-_SANITIZED = "DXLRUN_SANITIZED"  # Environment variable with the sanitized object
 
 
 def random_bytes(chance: random.Random, count: int) -> bytes:
@@ -126,12 +120,8 @@ def main() -> None:
     parser.add_argument("--sanitized", action="store_true", help="with AddressSanitizer and UBSan of gcc")
     chosen = parser.parse_args()
     if chosen.sanitized:
-        with tempfile.TemporaryDirectory() as folder:
-            path = str(compile_sanitized(compiled_pairing.SOURCE, Path(folder)))
-            command = [sys.executable, __file__, str(chosen.count), "--seed", str(chosen.seed)]
-            sys.exit(subprocess.call(command, env={**sanitizing_environment(), _SANITIZED: path}))
-    if compiled := os.environ.get(_SANITIZED):
-        compiled_pairing.load_compiled = partial(load_compiled, path=Path(compiled))  # type: ignore[attr-defined]
+        run_sanitized([compiled_pairing])
+    load_sanitized([compiled_pairing])
     print("{} times, {} missing replies".format(*campaign(chosen.count, chosen.seed)))
 
 

@@ -19,27 +19,22 @@ import ctypes
 import gc
 import itertools
 import math
-import os
 import random
 import resource
-import subprocess
 import sys
-import tempfile
 import time
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from bench.sanitizers import compile_sanitized, sanitizing_environment
+from bench.sanitizers import load_sanitized, run_sanitized
 
 from dxlsim.bus.ledger import Ledger
 from dxlsim.bus.simulated_bus import SimulatedBus
 from dxlsim.motion import compiled_mechanics
 from dxlsim.simulation_plan import AdapterConfig, BusConfig, ServoConfig
 from dxlsim.wire import compiled_line
-from dxlwire.compiled import load_compiled
 from dxlwire.control_table import ControlTable, all_tables
 
 PER_SERVO = 250
@@ -49,7 +44,6 @@ PER_PAUSE = 10
 INSTRUCTIONS = (1, 2, 3, 4, 5, 6, 8, 0x10, 0x20, 0x82, 0x83, 0x8A, 0x92, 0x93, 0x9A, 0x55, 0x77)
 FIXED = (b"\x01\x44\x58\x4c\x22", b"\x02\x45\x52\x43\x4c", b"\x01\x43\x54\x52\x4c", b"\x02\x43\x54\x52\x4c")
 BROADCAST = 0xFE
-_SANITIZED = "DXLSIM_SANITIZED"  # Environment variable with the folder of the sanitized objects
 
 
 @dataclass(slots=True)
@@ -349,13 +343,6 @@ def memory_kib() -> int:
     return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() // 1024
 
 
-def load_sanitized(folder: Path) -> None:
-    """Use the objects of a folder in place of those that were built."""
-    for module in (compiled_line, compiled_mechanics):
-        path = folder / f"lib{module.SOURCE.stem}.so"
-        module.load_compiled = partial(load_compiled, path=path)  # type: ignore[attr-defined]
-
-
 def main() -> None:
     """Run the campaign: strings, half of them for each protocol, and a move of shafts for ten of them."""
     parser = argparse.ArgumentParser()
@@ -363,14 +350,10 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--sanitized", action="store_true", help="with AddressSanitizer and UBSan of gcc")
     chosen = parser.parse_args()
+    modules = (compiled_line, compiled_mechanics)
     if chosen.sanitized:
-        with tempfile.TemporaryDirectory() as folder:
-            for module in (compiled_line, compiled_mechanics):
-                compile_sanitized(module.SOURCE, Path(folder))
-            command = [sys.executable, __file__, str(chosen.strings), "--seed", str(chosen.seed)]
-            sys.exit(subprocess.call(command, env={**sanitizing_environment(), _SANITIZED: folder}))
-    if folder := os.environ.get(_SANITIZED):
-        load_sanitized(Path(folder))
+        run_sanitized(modules)
+    is_sanitized = load_sanitized(modules)
     for protocol in (1.0, 2.0):
         campaign(protocol, 25_000, chosen.seed)  # all models are loaded
         before, began = memory_kib(), time.monotonic()
@@ -379,7 +362,7 @@ def main() -> None:
         shake(protocol, chosen.strings // 20, chosen.seed)
         took = time.monotonic() - began
         print(f"Protocol {protocol}: {tally}, memory grew by {grown} KiB, {took:.0f} s", flush=True)
-        assert grown < (1 << 20 if folder else 4096), "something is never given back"
+        assert grown < (1 << 20 if is_sanitized else 4096), "something is never given back"
 
 
 if __name__ == "__main__":

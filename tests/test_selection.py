@@ -57,7 +57,7 @@ def test_long_tests_are_first(tmp_path: Path) -> None:
 
 
 def test_each_worker_begins_with_slow_files_and_ends_with_short_tests() -> None:
-    """Of 12 tests: `a/2` is the second of folder a, L one of a slow file."""
+    """The 12 tests are named by folder and number, and with L in a slow file."""
     names = ["a/L1", "a/2", "b/L1", "b/L2", "b/3", "b/4", "c/L1", "c/2", "c/3", "c/4", "c/5", "c/6"]
     items = [
         SimpleNamespace(

@@ -1,16 +1,34 @@
 """Form of the section `tip_poses` of the robot file."""
 
-from typing import TYPE_CHECKING, Annotated, Self
+import math
+from typing import Annotated, Final, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
 from dxlrun import Angle, Length
 from dxlrun.tooling.features import Section
 from dxlrun.tooling.files import Form, Name, key
-from dxlrun_space.orientation_checks import at_most_a_turn, check_turns
 
-if TYPE_CHECKING:
-    from dxlrun_space.space_goals import PoseCommand
+NORM: Final = 1e-3
+"""Largest difference of a quaternion's length from 1: three decimals of each number."""
+
+
+def at_most_a_turn(value: float) -> float:
+    """Return an angle, rad; raise ValueError if it is more than a turn."""
+    if abs(value) > 2 * math.pi:
+        raise ValueError(
+            f"{value:g} rad is more than a turn; write at most a turn, with its unit, such as 90deg"
+        )
+    return value
+
+
+def check_turns(quaternion: tuple[float, ...] | None, *others: tuple[float, ...] | None) -> None:
+    """Raise ValueError for more than one orientation, or a quaternion that is not of length 1."""
+    if sum(each is not None for each in (quaternion, *others)) > 1:
+        raise ValueError("give only one of rpy, drpy and quaternion; remove the others")
+    if quaternion is not None and abs(math.hypot(*quaternion) - 1) > NORM:
+        raise ValueError(f"the quaternion has length {math.hypot(*quaternion):.4g}; scale it to length 1")
+
 
 _Place = Annotated[Length, Field(ge=-100, le=100)]  # As in the command `pose`
 _Turn = Annotated[Angle, AfterValidator(at_most_a_turn)]
@@ -42,13 +60,6 @@ class TipPose(Form):
     def _has_one_orientation(self) -> Self:
         check_turns(self.quaternion, self.rpy)
         return self
-
-    def as_command(self) -> "PoseCommand":
-        """Return the pose as a command."""
-        # Imported here because every robot file needs this form, and few have a pose of a link.
-        from dxlrun_space.space_goals import PoseCommand
-
-        return PoseCommand.model_validate(self.model_dump(include={"x", "y", "z", "rpy", "quaternion"}))
 
 
 STAGE: Section[dict[str, TipPose]] = Section(

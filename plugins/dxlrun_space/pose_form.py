@@ -12,6 +12,7 @@ from dxlrun_space.chain import BASE, Chain, WrongChain
 from dxlrun_space.form import TipPose
 from dxlrun_space.path import out_of_reach, suffices
 from dxlrun_space.solver import Orientation, Solver, demands_orientation, finish_search
+from dxlrun_space.space_goals import PoseCommand
 
 
 class SolvedPose(NamedTuple):
@@ -44,7 +45,7 @@ def solve_pose(
     near = [pose.near.get(joint) for joint in chain.joints]
     solver = Solver(chain, [plan.lower for plan in plans], [plan.upper for plan in plans], near)
     start = tuple(each or 0.0 for each in near)
-    goal = pose.as_command()
+    goal = PoseCommand.model_validate(pose.model_dump(include={"x", "y", "z", "rpy", "quaternion"}))
     exact = goal.asks_orientation and any(
         demands_orientation(each, len(plans)) for each in orientations or (None,)
     )

@@ -12,7 +12,7 @@ from pydantic import BeforeValidator, Field, TypeAdapter, model_validator
 from dxlrun import NAMED_POSE, Angle, AngularVelocity, CommandModel, Floats, Length, LinearVelocity
 from dxlrun.tooling.robots import Transform, from_rpy, product
 from dxlrun_space.chain import Vector
-from dxlrun_space.orientation_checks import at_most_a_turn, check_turns
+from dxlrun_space.form import at_most_a_turn, check_turns
 
 C = TypeVar("C", bound=CommandModel)
 

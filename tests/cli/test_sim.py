@@ -175,21 +175,29 @@ def test_servos_without_a_robot_file_answer_and_take_planned_and_typed_faults(
 def test_programs_of_the_page_run_against_the_servos_of_the_page(start: Start, tmp_path: Path) -> None:
     link = str(tmp_path / "robot")
     (words,) = re.findall(r"^    dxlrun sim (--servo XL430.+)$", page_text("simulation.md"), re.MULTILINE)
-    sim = start(*words.replace("/tmp/robot", link).split(), "--json")  # noqa: S108
+    words, *programs = (
+        text.replace("/tmp/robot", link)  # noqa: S108
+        for text in (words, *page_blocks("simulation.md", "python"))
+    )
+    sim = start(*words.split(), "--json")
     assert sim.result()["ports"] == {"main": link}
     path = {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
 
     def output_of(code: str) -> str | None:
         """Return what a program prints; None where it got no reply in time, on a busy machine."""
-        command = [sys.executable, "-c", code.replace("/tmp/robot", link)]  # noqa: S108
         ran = subprocess.run(
-            command, capture_output=True, text=True, cwd=tmp_path, env=os.environ | path, check=False
+            [sys.executable, "-c", code],
+            capture_output=True,
+            text=True,
+            cwd=tmp_path,
+            env=os.environ | path,
+            check=False,
         )
         is_late = "(0, -3001, 0)" in ran.stdout or "timed out" in ran.stderr.lower()
         assert is_late or ran.returncode == 0, ran.stderr
         return None if is_late else ran.stdout
 
-    said = [until(lambda code=code: output_of(code)) for code in page_blocks("simulation.md", "python")]
+    said = [until(lambda code=code: output_of(code)) for code in programs]
     assert said[0] == "(1060, 0, 0)\n"
     assert len(json.loads(said[1])) == 3
     assert result_of(said[2]) == {"fault": "silence servo=2"}

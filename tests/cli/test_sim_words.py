@@ -86,7 +86,7 @@ def test_one_bus_has_the_link_and_several_have_its_name_and_theirs(tmp_path: Pat
 
 
 def test_link_of_a_simulation_that_runs_is_not_taken_over(tmp_path: Path) -> None:
-    """A simulation whose link another one took over, and removed at its end, was out of reach."""
+    """A second simulation must not replace the link of the first, and remove it when it ends."""
     link, (terminal, device) = tmp_path / "robot", os.openpty()
     link.symlink_to(os.ttyname(device))
     try:

@@ -111,8 +111,8 @@ def test_check_imports_no_part_that_runs(checked: tuple[set[str], set[str]]) -> 
     assert packages <= {f"dxlrun_{one}{part}" for one in ("analysis", "lab") for part in ("", ".plugin")}
     unused = "mujoco mcap starlette uvicorn lz4 zstandard serial matplotlib simpleeval rich subprocess"
     assert beneath(modules, *unused.split()) == set()
-    # Codes of answers, ROS 2 messages and goals in space are for controllers that use them.
-    assert beneath(modules, "dxlrun.channels.answers", "dxlrun.messages", "dxlrun_space.space_goals") == set()
+    # ROS 2 messages and goals in space are for controllers that use them.
+    assert beneath(modules, "dxlrun.messages", "dxlrun_space.space_goals") == set()
     # the names above are those of modules that exist
     assert modules >= {"dxlrun.compile.robot_compiler", "dxlrun.description.robot", "pydantic", "yaml"}
     for room, parts in RUN_TIME.items():

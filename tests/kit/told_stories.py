@@ -170,7 +170,7 @@ class Story:
                 clock.wait_until(clock.now_ns() + busy.pop(0)[1])
             read()
 
-        hardware.read_states = read_late  # type: ignore[method-assign]
+        vars(hardware)["read_states"] = read_late
 
     def _watch(self, robot: VirtualRobot) -> None:
         for bus in robot.buses:

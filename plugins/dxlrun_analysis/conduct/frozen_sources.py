@@ -153,8 +153,9 @@ class FrozenSources:
             return
         self._plan, self._states = plan_of(log), dict(log.header.sources)
         known = {source.name for source in self._plan.loop.sources}
-        names = [(index, name) for index, (name, states) in enumerate(self._states.items()) if states]
-        names = [(index, name) for index, name in names if name in known]
+        names = [
+            (index, name) for index, name in enumerate(self._states) if self._states[name] and name in known
+        ]
         if not names:
             return
         position, at_ns = np.nan_to_num(log.cycles["position"]), log.cycles["read_ns"]

@@ -324,7 +324,7 @@ class KeyframePlayer(Controller[KeyframeParameters]):
             return super().prepare(kind, command, parameters)
         names = list(parameters.motions)
         if command.motion not in names:
-            raise ValueError(f"there is no motion {command.motion!r}; {suggestion(command.motion, names)}")
+            raise ValueError(f"motion {command.motion!r} not found; {suggestion(command.motion, names)}")
         repeat = command.repeat or parameters.motions[command.motion].repeat
         return np.array([names.index(command.motion), command.speed, repeat])
 

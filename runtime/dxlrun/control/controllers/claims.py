@@ -7,16 +7,13 @@ them, so it enters after them and leaves before them, in the same step.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from typing import TYPE_CHECKING
 
 import msgspec
 
+from dxlrun.channels.answers import Code, Field, Refusal
 from dxlrun.control.controllers.update_order import Plans, below, commander, lowers_first, uppers_first
 from dxlrun.plan.loop_plan import ControllerPlan, JointPlan
 from dxlwire.modes import Mode, mode_of
-
-if TYPE_CHECKING:
-    from dxlrun.channels.answers import Field, Refusal
 
 
 class Conflict(msgspec.Struct, frozen=True):
@@ -140,9 +137,6 @@ class ControllerSnapshot(msgspec.Struct, frozen=True):
 
         Inactive controllers below the activated ones are activated too.
         """
-        # Imported here because the compiler shares this module, and switches nothing.
-        from dxlrun.channels.answers import Code, Refusal
-
         known, engaged = self.known, self.engaged
         for code, names in (
             (Code.UNKNOWN_CONTROLLER, [name for name in (*activate, *deactivate) if name not in known]),
@@ -180,9 +174,6 @@ class ControllerSnapshot(msgspec.Struct, frozen=True):
         the controllers above them. Requested controllers that are already active or entering stay as they
         are.
         """
-        # Imported here as in `switch`.
-        from dxlrun.channels.answers import Code, Refusal
-
         known = self.known
         needed = [known[name] for name in lowers_first(names, known)]
         for missing in (
@@ -249,9 +240,6 @@ class ControllerSnapshot(msgspec.Struct, frozen=True):
 
 
 def _clash(found: Sequence[Conflict]) -> Refusal:
-    # Imported here as in `ControllerSnapshot.switch`.
-    from dxlrun.channels.answers import Code, Refusal
-
     fields: dict[str, Field] = {
         "conflict": conflicts_text(found),
         "joints": tuple(conflict.joint for conflict in found),
