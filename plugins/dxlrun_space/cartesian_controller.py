@@ -6,7 +6,7 @@ import math
 from collections.abc import Generator, Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Annotated, ClassVar, Final, TypeAlias
+from typing import Annotated, ClassVar, Final, TypeAlias, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,7 +47,7 @@ from dxlrun_space.path import (
     plan_positions,
 )
 from dxlrun_space.solver import Orientation, Solver, demands_orientation, distance, residual_of
-from dxlrun_space.space_goals import PoseCommand, TwistCommand, packed, unpacked
+from dxlrun_space.space_goals import PoseCommand, TipGoal, TipTwist, TwistCommand, packed, unpacked
 from dxlrun_space.stream import TipMotion, Twist
 
 ACCELERATION: Final = 20.0
@@ -209,12 +209,7 @@ class CartesianController(Controller[CartesianParameters]):
         if parameters.leader is not None:
             fix = "send it to a cartesian_controller without `leader`"
             raise ValueError(f"the tip follows a leader, so a {kind} is not accepted; {fix}")
-        if isinstance(command, PoseCommand) and command.pose is not None:
-            if lacking := [joint for joint in parameters.joints if joint not in command.pose]:
-                raise ValueError(f"the pose has no position of {', '.join(lacking)}; name a pose of this arm")
-            own = {joint: command.pose[joint] for joint in parameters.joints}
-            command = command.model_copy(update={"pose": own})
-        return packed(command)
+        return packed(cast("PoseCommand | TwistCommand", command).prepared(parameters.joints))
 
     @classmethod
     def check_command(
@@ -254,8 +249,6 @@ class CartesianController(Controller[CartesianParameters]):
         self._at: Positions = ()
         """Commanded positions, rad; empty while a joint has not answered yet."""
         self._now_ns, self._period_s = 0, context.period_ns * 1e-9
-        for command in (PoseCommand, TwistCommand):
-            command.model_rebuild()  # otherwise by the first one in the loop, which takes milliseconds
         self._forget()
 
     def _forget(self) -> None:
@@ -264,7 +257,7 @@ class CartesianController(Controller[CartesianParameters]):
         self._tried: Transform | None = None
         """Goal pose of the tip for which `plan` asked, until the answer."""
         self._goal: Goal | None = None
-        self._waiting: PoseCommand | None = None
+        self._waiting: TipGoal | None = None
         self._is_cancelled = False
         self._target: Transform | None = None
         self._commanded_ns = 0
@@ -303,17 +296,17 @@ class CartesianController(Controller[CartesianParameters]):
         if joint := "" if self._at else self._hold_joints():
             self._end(Outcome.ABORTED, f"joint {joint} has not answered yet")
         else:
-            self._pass_to(unpacked(data, PoseCommand))
+            self._pass_to(unpacked(data, TipGoal))
 
     def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
         """Follow a twist; a pose that is under way ends as preempted. Or plan without moving."""
         if kind == "twist":
             if self._at or not self._hold_joints():
-                self._follow_twist(unpacked(data, TwistCommand), time_ns)
+                self._follow_twist(unpacked(data, TipTwist), time_ns)
         else:
-            self._begin_plan(unpacked(data, PoseCommand))
+            self._begin_plan(unpacked(data, TipGoal))
 
-    def _begin_plan(self, asked: PoseCommand) -> None:
+    def _begin_plan(self, asked: TipGoal) -> None:
         self._drop_plan("replaced by a newer request")
         try:
             if joint := "" if self._at else self._hold_joints():
@@ -327,7 +320,7 @@ class CartesianController(Controller[CartesianParameters]):
         else:
             self._task, self._tried = self._try(asked, goal), goal
 
-    def _follow_twist(self, twist: TwistCommand, time_ns: int) -> None:
+    def _follow_twist(self, twist: TipTwist, time_ns: int) -> None:
         self._turns_with_tip = twist.frame == self._chain.tip
         try:
             rotation = (BASE if self._turns_with_tip else self._pose_of(twist.frame)).rotation
@@ -339,8 +332,7 @@ class CartesianController(Controller[CartesianParameters]):
         self._is_ignoring, self._commanded_ns = False, time_ns
         if self._goal is not None:
             self._end(Outcome.PREEMPTED, "replaced by a twist")
-        linear, angular = twist.twist
-        self._pass_to(None, (rotated(rotation, linear), rotated(rotation, angular)))
+        self._pass_to(None, (rotated(rotation, twist.linear), rotated(rotation, twist.angular)))
 
     def on_hold(self, time_ns: int) -> None:
         """Brake from the twist: the stream has ended."""
@@ -352,7 +344,7 @@ class CartesianController(Controller[CartesianParameters]):
         self._is_cancelled = True
         self._pass_to(None)
 
-    def _pass_to(self, pose: PoseCommand | None, twist: Twist = NO_TWIST) -> None:
+    def _pass_to(self, pose: TipGoal | None, twist: Twist = NO_TWIST) -> None:
         """Brake on the path, then pursue a pose or a twist; at once if the tip rests."""
         self._waiting, self._twist, self._brakes = pose, twist, True
         if not self._moves:
@@ -378,10 +370,10 @@ class CartesianController(Controller[CartesianParameters]):
         if goal is not None:
             goal.end(outcome, text)
 
-    def _goal_pose(self, asked: PoseCommand) -> Transform:
+    def _goal_pose(self, asked: TipGoal) -> Transform:
         """Return the goal pose of the tip in the base. Raises as `_pose_of`."""
-        if asked.pose is not None:
-            return self._chain.pose(tuple(asked.pose.values()))
+        if asked.positions:
+            return self._chain.pose(asked.positions)
         return asked.target(self._pose_of(asked.frame), self._chain.pose(self._at))
 
     def _pose_of(self, frame: str) -> Transform:
@@ -437,16 +429,16 @@ class CartesianController(Controller[CartesianParameters]):
         self._end(Outcome.ABORTED, text)
         self._forget()
 
-    def _planned(self, asked: PoseCommand) -> Planning:
+    def _planned(self, asked: TipGoal) -> Planning:
         """Plan a motion from rest."""
         try:
             self._target = self._goal_pose(asked)
         except (LookupError, ValueError) as error:
             return NoPath(str(error))
-        solver, exact = self._solver, self._exact and asked.asks_orientation
+        solver, exact = self._solver, self._exact and asked.rotation is not None
         at, limits = self._at, self._limits
-        if asked.pose is not None:
-            planning = plan_positions(solver, at, tuple(asked.pose.values()), self._target, limits)
+        if asked.positions:
+            planning = plan_positions(solver, at, asked.positions, self._target, limits)
         else:
             plan = plan_line if asked.path == "line" else plan_joints
             planning = plan(solver, at, self._target, limits, exact=exact)
@@ -456,7 +448,7 @@ class CartesianController(Controller[CartesianParameters]):
             return NoPath(f"the motion takes {needed:.2f} s within its limits; ask for at least this time")
         return found
 
-    def _try(self, asked: PoseCommand, goal: Transform) -> Task:
+    def _try(self, asked: TipGoal, goal: Transform) -> Task:
         """Plan a motion from rest to a pose, and publish it."""
         found = yield from self._planned(asked)
         self._tried = None
@@ -479,7 +471,7 @@ class CartesianController(Controller[CartesianParameters]):
         last = np.array(positions or (math.nan,) * len(self.context.joints))
         self.context.publish("plan", PosePlan(x, y, z, last, seconds, text))
 
-    def _pursue(self, asked: PoseCommand) -> Task:
+    def _pursue(self, asked: TipGoal) -> Task:
         """Plan a motion to a pose, make it, and let the runtime judge the goal at the end of the path.
 
         The time of the path passes more slowly while the tip brakes.
@@ -568,9 +560,9 @@ class CartesianController(Controller[CartesianParameters]):
             yield
 
 
-def _remark(path: Path, asked: PoseCommand) -> str:
+def _remark(path: Path, asked: TipGoal) -> str:
     """Return what is not reached at the end of a path; empty if all is."""
-    if not asked.asks_orientation or path.residual.is_close:
+    if asked.rotation is None or path.residual.is_close:
         return ""
     off = math.degrees(path.residual.orientation)
     return f"{off:.1f} deg from the orientation, which the arm cannot reach"

@@ -8,6 +8,7 @@ from pydantic import AfterValidator, Field, model_validator
 from dxlrun import Angle, Length
 from dxlrun.tooling.features import Section
 from dxlrun.tooling.files import Form, Name, key
+from dxlrun.tooling.robots import from_rpy
 
 NORM: Final = 1e-3
 """Largest difference of a quaternion's length from 1: three decimals of each number."""
@@ -28,6 +29,16 @@ def check_turns(quaternion: tuple[float, ...] | None, *others: tuple[float, ...]
         raise ValueError("give only one of rpy, drpy and quaternion; remove the others")
     if quaternion is not None and abs(math.hypot(*quaternion) - 1) > NORM:
         raise ValueError(f"the quaternion has length {math.hypot(*quaternion):.4g}; scale it to length 1")
+
+
+def rotation_of(
+    quaternion: tuple[float, float, float, float] | None, rpy: tuple[float, float, float] | None
+) -> tuple[float, float, float, float] | None:
+    """Return an orientation as a quaternion of length 1; None: none is given."""
+    if quaternion is None:
+        return None if rpy is None else from_rpy(rpy)
+    length, (x, y, z, w) = math.hypot(*quaternion), quaternion
+    return x / length, y / length, z / length, w / length
 
 
 _Place = Annotated[Length, Field(ge=-100, le=100)]  # As in the command `pose`

@@ -7,12 +7,11 @@ from typing import NamedTuple
 
 from dxlrun.tooling.features import PoseStage
 from dxlrun.tooling.plans import JointPlan
-from dxlrun.tooling.robots import Urdf, read_urdf
+from dxlrun.tooling.robots import Transform, Urdf, read_urdf
 from dxlrun_space.chain import BASE, Chain, WrongChain
-from dxlrun_space.form import TipPose
+from dxlrun_space.form import TipPose, rotation_of
 from dxlrun_space.path import out_of_reach, suffices
 from dxlrun_space.solver import Orientation, Solver, demands_orientation, finish_search
-from dxlrun_space.space_goals import PoseCommand
 
 
 class SolvedPose(NamedTuple):
@@ -45,21 +44,17 @@ def solve_pose(
     near = [pose.near.get(joint) for joint in chain.joints]
     solver = Solver(chain, [plan.lower for plan in plans], [plan.upper for plan in plans], near)
     start = tuple(each or 0.0 for each in near)
-    goal = PoseCommand.model_validate(pose.model_dump(include={"x", "y", "z", "rpy", "quaternion"}))
-    exact = goal.asks_orientation and any(
+    rotation = rotation_of(pose.quaternion, pose.rpy)
+    exact = rotation is not None and any(
         demands_orientation(each, len(plans)) for each in orientations or (None,)
     )
-    target = goal.target(BASE, chain.pose(start))
-    search = (
-        solver.search(target, start, exact=exact)
-        if goal.asks_orientation
-        else solver.search_place(target, start)
-    )
+    target = Transform((pose.x, pose.y, pose.z), rotation or BASE.rotation)
+    search = solver.search(target, start, exact=exact) if rotation else solver.search_place(target, start)
     found = finish_search(search)
     if not suffices(found.residual, exact):
         fix = "move the pose, or give it another orientation"
         raise WrongChain("", out_of_reach(found.residual, exact), fix)
-    return SolvedPose(solver, found.positions, found.residual.orientation if goal.asks_orientation else 0.0)
+    return SolvedPose(solver, found.positions, found.residual.orientation if rotation else 0.0)
 
 
 def chain_of(pose: TipPose, urdf: Urdf | None) -> Chain:

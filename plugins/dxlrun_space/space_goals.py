@@ -2,19 +2,55 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Literal, Self, TypeVar
 
+import msgspec
 import numpy as np
 from pydantic import BeforeValidator, Field, TypeAdapter, model_validator
 
 from dxlrun import NAMED_POSE, Angle, AngularVelocity, CommandModel, Floats, Length, LinearVelocity
-from dxlrun.tooling.robots import Transform, from_rpy, product
-from dxlrun_space.chain import Vector
-from dxlrun_space.form import at_most_a_turn, check_turns
+from dxlrun.tooling.robots import Transform, product
+from dxlrun_space.chain import Quaternion, Vector
+from dxlrun_space.form import at_most_a_turn, check_turns, rotation_of
 
-C = TypeVar("C", bound=CommandModel)
+S = TypeVar("S", bound=msgspec.Struct)
+
+
+class TipGoal(msgspec.Struct, frozen=True, array_like=True):
+    """Goal pose of the tip in the axes of a frame, prepared for the loop."""
+
+    place: tuple[float | None, float | None, float | None]
+    """Position, m; None: the one at the start."""
+    way: Vector
+    """Distance from `place`, m."""
+    rotation: Quaternion | None
+    """Orientation, or a turn from the one at the start; None: the one at the start as far as the arm can."""
+    is_turn: bool
+    frame: str
+    path: Literal["line", "joints"]
+    seconds: float | None
+    """Duration, s; None: the shortest."""
+    positions: tuple[float, ...]
+    """Positions of the joints, rad or m, in place of all above; empty: not given."""
+
+    def target(self, frame: Transform, tip: Transform) -> Transform:
+        """Return the goal pose in the base from the poses of the frame and of the tip at the start."""
+        present = frame.inverse @ tip
+        x, y, z = (
+            (now if goal is None else goal) + way
+            for now, goal, way in zip(present.translation, self.place, self.way, strict=True)
+        )
+        turned = product(self.rotation, present.rotation) if self.rotation and self.is_turn else self.rotation
+        return frame @ Transform((x, y, z), turned or present.rotation)
+
+
+class TipTwist(msgspec.Struct, frozen=True, array_like=True):
+    """Velocity of the tip in the axes of a frame, prepared for the loop."""
+
+    linear: Vector  # m/s
+    angular: Vector  # rad/s
+    frame: str
 
 
 def _si(adapter: TypeAdapter[float]) -> BeforeValidator:
@@ -89,28 +125,21 @@ class PoseCommand(CommandModel):
         check_turns(self.quaternion, self.rpy, self.drpy)
         return self
 
-    @property
-    def asks_orientation(self) -> bool:
-        """True if the pose has an orientation, absolute or relative."""
-        return any(each is not None for each in (self.rpy, self.drpy, self.quaternion))
-
-    def target(self, frame: Transform, tip: Transform) -> Transform:
-        """Return the goal pose in the base from the poses of the frame and of the tip at the start."""
-        present = frame.inverse @ tip
-        goals, ways = (self.x, self.y, self.z), (self.dx or 0.0, self.dy or 0.0, self.dz or 0.0)
-        a, b, c = (
-            (now if goal is None else goal) + way
-            for now, goal, way in zip(present.translation, goals, ways, strict=True)
+    def prepared(self, joints: Sequence[str]) -> TipGoal:
+        """Return the goal of an arm with these joints; raise ValueError if the named pose lacks one."""
+        named = self.pose
+        if named is not None and (lacking := [joint for joint in joints if joint not in named]):
+            raise ValueError(f"the pose has no position of {', '.join(lacking)}; name a pose of this arm")
+        return TipGoal(
+            place=(self.x, self.y, self.z),
+            way=(self.dx or 0.0, self.dy or 0.0, self.dz or 0.0),
+            rotation=rotation_of(self.quaternion, self.rpy or self.drpy),
+            is_turn=self.drpy is not None,
+            frame=self.frame,
+            path=self.path,
+            seconds=self.seconds,
+            positions=() if named is None else tuple(named[joint] for joint in joints),
         )
-        rotation = present.rotation
-        if self.rpy is not None:
-            rotation = from_rpy(self.rpy)
-        elif self.drpy is not None:
-            rotation = product(from_rpy(self.drpy), rotation)
-        elif self.quaternion is not None:
-            length, (x, y, z, w) = math.hypot(*self.quaternion), self.quaternion
-            rotation = x / length, y / length, z / length, w / length
-        return frame @ Transform((a, b, c), rotation)
 
 
 class TwistCommand(CommandModel):
@@ -127,17 +156,16 @@ class TwistCommand(CommandModel):
     frame: _Frame = ""
     """Link whose axes are meant; those of the tip turn with it. Empty: the base of the controller"""
 
-    @property
-    def twist(self) -> tuple[Vector, Vector]:
-        """Linear and angular velocity."""
-        return (self.vx, self.vy, self.vz), (self.wx, self.wy, self.wz)
+    def prepared(self, joints: Sequence[str]) -> TipTwist:
+        """Return the twist for the loop."""
+        return TipTwist((self.vx, self.vy, self.vz), (self.wx, self.wy, self.wz), self.frame)
 
 
-def packed(command: CommandModel) -> Floats:
-    """Return a command as an array for the loop: one number per byte of its JSON."""
-    return np.frombuffer(command.model_dump_json(exclude_defaults=True).encode(), np.uint8).astype(np.float64)
+def packed(prepared: TipGoal | TipTwist) -> Floats:
+    """Return a goal or twist as an array for the loop: one number per byte of its MessagePack."""
+    return np.frombuffer(msgspec.msgpack.encode(prepared), np.uint8).astype(np.float64)
 
 
-def unpacked(data: Floats, kind: type[C]) -> C:
-    """Return the command in an array of `packed`."""
-    return kind.model_validate_json(data.astype(np.uint8).tobytes())
+def unpacked(data: Floats, kind: type[S]) -> S:
+    """Return the goal or twist in an array of `packed`."""
+    return msgspec.msgpack.decode(data.astype(np.uint8).tobytes(), type=kind)
