@@ -292,9 +292,9 @@ class CartesianController(Controller[CartesianParameters]):
 
     def on_goal(self, goal: Goal, data: NDArray[np.float64], time_ns: int) -> None:
         """Plan a motion to the pose; a motion that is under way brakes first."""
-        self._goal, self._is_cancelled = goal, False
+        self._goal, self._target, self._is_cancelled = goal, None, False
         if joint := "" if self._at else self._hold_joints():
-            self._end(Outcome.ABORTED, f"joint {joint} has not answered yet")
+            self._fail(f"joint {joint} has not answered yet")
         else:
             self._pass_to(unpacked(data, TipGoal))
 
@@ -370,6 +370,12 @@ class CartesianController(Controller[CartesianParameters]):
         if goal is not None:
             goal.end(outcome, text)
 
+    def _fail(self, text: str) -> None:
+        """Abort the goal because of a joint."""
+        if self._goal is not None and (self._waiting is not None or not self._moves):
+            self._goal.feedback(0.0)  # otherwise the end before the motion is a refusal of the request
+        self._end(Outcome.ABORTED, text)
+
     def _goal_pose(self, asked: TipGoal) -> Transform:
         """Return the goal pose of the tip in the base. Raises as `_pose_of`."""
         if asked.positions:
@@ -426,22 +432,18 @@ class CartesianController(Controller[CartesianParameters]):
         if self._target is not None and self._at:
             left = residual_of(self._chain.pose(self._at), self._target)
             text = f"held {left.position * 1e3:.0f} mm before the pose"
-        self._end(Outcome.ABORTED, text)
+        self._fail(text)
         self._forget()
 
-    def _planned(self, asked: TipGoal) -> Planning:
+    def _planned(self, asked: TipGoal, target: Transform) -> Planning:
         """Plan a motion from rest."""
-        try:
-            self._target = self._goal_pose(asked)
-        except (LookupError, ValueError) as error:
-            return NoPath(str(error))
         solver, exact = self._solver, self._exact and asked.rotation is not None
         at, limits = self._at, self._limits
         if asked.positions:
-            planning = plan_positions(solver, at, asked.positions, self._target, limits)
+            planning = plan_positions(solver, at, asked.positions, target, limits)
         else:
             plan = plan_line if asked.path == "line" else plan_joints
-            planning = plan(solver, at, self._target, limits, exact=exact)
+            planning = plan(solver, at, target, limits, exact=exact)
         found = yield from planning
         if isinstance(found, Path) and asked.seconds is not None and asked.seconds < found.duration_s:
             needed = math.ceil(found.duration_s * 100) / 100
@@ -450,7 +452,7 @@ class CartesianController(Controller[CartesianParameters]):
 
     def _try(self, asked: TipGoal, goal: Transform) -> Task:
         """Plan a motion from rest to a pose, and publish it."""
-        found = yield from self._planned(asked)
+        found = yield from self._planned(asked, goal)
         self._tried = None
         if isinstance(found, NoPath):
             self._publish(goal, found.text)
@@ -476,7 +478,12 @@ class CartesianController(Controller[CartesianParameters]):
 
         The time of the path passes more slowly while the tip brakes.
         """
-        path = yield from self._planned(asked)
+        try:
+            self._target = self._goal_pose(asked)
+        except (LookupError, ValueError) as error:
+            self._fail(str(error))
+            return
+        path = yield from self._planned(asked, self._target)
         if isinstance(path, NoPath):
             self._end(Outcome.ABORTED, path.text)
             return

@@ -38,6 +38,7 @@ class Goal(RunningGoal):
     def feedback(self, progress: float, error: float = float("nan")) -> None:
         assert (self.outcome, self.is_judged) == (None, False), "feedback after the end"
         self.progresses.append((progress, error))
+        super().feedback(progress, error)
 
     def judge(self, positions: Any = None, *, joints: Sequence[str] | None = None, **more: Any) -> None:
         assert (self.outcome, self.is_judged) == (None, False), "handed over twice"

@@ -137,6 +137,7 @@ def test_what_cannot_be_is_refused_before_a_joint_moves(pose: dict[str, Any], te
     stage.send(0.0, "pose", **pose)
     rows = played(stage, 9.0)
     assert rows == pytest.approx(np.tile(READY, (len(rows), 1)), abs=1e-12)
+    assert stage.goal.refusal is not None
     assert (stage.goal.ended[0][0], stage.goal.ended[0][1][: len(text)]) == ("aborted", text)
 
 
@@ -271,25 +272,31 @@ def test_a_new_goal_brakes_first_and_hostile_ones_do_no_harm() -> None:
     assert {goal.ended[0][0] for goal in stage.goals[:-1]} <= {"preempted", "aborted"}
 
 
-def test_a_lost_joint_ends_the_goal_with_the_distance() -> None:
+@pytest.mark.parametrize(
+    ("sent", "text"), [((), ""), ((0.02,), "; held 100 mm b"), ((0.6,), "; held 49 mm b"), ((0.6, 0.0), "")]
+)
+def test_a_lost_joint_aborts_the_goal_with_the_distance(sent: tuple[float, ...], text: str) -> None:
+    """Also before the motion, where an end would be a refusal, and while the tip brakes for the goal."""
     stage = staged()
-    stage.send(0.0, "pose", dz=0.1)
-    played(stage, 0.6)
-    held = stage.commands.position.copy()
+    for seconds in sent or (0.0,):
+        stage.send(None, "pose", dz=0.1)
+        played(stage, seconds)
+    held = stage.commands.position.copy() if sent else READY
     stage.states.torque[1] = Torque.LOST
     rows = played(stage, 0.2)
     assert rows == pytest.approx(np.tile(held, (len(rows), 1)))
-    assert stage.goal.ended[0][0] == "aborted"
-    assert stage.goal.ended[0][1].startswith("joint joint2 does not answer; held ")
-    assert stage.goal.ended[0][1].endswith(" mm before the pose")
+    assert (stage.goal.ended[0][0], stage.goal.refusal) == ("aborted", None)
+    assert stage.goal.progress == pytest.approx(0.505 * (sent == (0.6,)), abs=1e-3)
+    assert stage.goal.ended[0][1] == f"joint joint2 does not answer{text}{'efore the pose' * bool(text)}"
 
 
-def test_a_joint_that_has_not_answered_refuses_goals() -> None:
+def test_a_joint_that_has_not_answered_aborts_goals() -> None:
     stage = staged()
     stage.states.position[2] = stage.sent.position[2] = math.nan
     stage.activate()
     stage.send(0.0, "pose", dz=0.1)
-    assert stage.goal.ended[0][1] == "joint joint3 has not answered yet"
+    assert stage.goal.ended[0][:2] == ("aborted", "joint joint3 has not answered yet")
+    assert stage.goal.refusal is None
     stage.states.position[2] = READY[2]  # but no update yet
     stage.send(None, "pose", dz=0.02)
     played(stage, 3.0)
@@ -306,7 +313,7 @@ def test_only_frames_that_a_silent_joint_moves_are_refused() -> None:
         stage.context.reads[1] = age
         stage.send(0.0, "pose", dz=0.01, frame="left_finger")
         assert played(stage, 0.2) == pytest.approx(np.tile(READY, (10, 1)))
-        assert stage.goal.ended[0][:2] == ("aborted", text)
+        assert (*stage.goal.ended[0][:2], stage.goal.refusal) == ("aborted", text, None)
         streamed(stage, 0.5, vz=0.05)
         rows = streamed(stage, 1.0, vz=0.05, frame="left_finger")
         assert stage.warned == [f"twist ignored: {text}"]

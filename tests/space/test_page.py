@@ -69,6 +69,19 @@ def test_bad_input_is_refused_with_the_reason_before_a_joint_moves(
     assert np.array_equal(robot.states().position, before)
 
 
+def test_a_joint_lost_before_the_motion_is_not_a_mistake_of_the_command(
+    dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    link = VirtualLink(plan_of(ROBOTS / "open_manipulator_x_space.yaml"))
+    monkeypatch.setattr(goals, "connect_robot", lambda *_: nullcontext(RemoteRobot("arm", link)))
+    link.simulated.buses[0].servo(12).silence()
+    for _ in range(100):
+        link.run_cycle()
+    said = dxlrun("send", "arm", "pose", "dz=1cm", "--wait")
+    assert said.code == 1
+    assert "joint2 (ID 12 on bus main) does not answer" in said.err
+
+
 def test_the_measured_tip_stays_on_a_line_of_20_cm() -> None:
     """Servos lag behind along the line, and leave it by their ticks."""
     link = VirtualLink(plan_of(ROBOTS / "open_manipulator_x_space.yaml"))
