@@ -24,14 +24,14 @@ pyproject.toml. A constant, because messages are also made in the loop, which re
 # A dataclass takes longer to import, and every command imports this module.
 class Mark(NamedTuple):
     """Position in a file, printed as `file:line:column`, to which editors can jump; line and column count
-    from 1."""
+    from 1. The line is 0 in a source without lines, such as the command line."""
 
     file: str
     line: int = 1
     column: int = 1
 
     def __str__(self) -> str:
-        return f"{self.file}:{self.line}:{self.column}"
+        return f"{self.file}:{self.line}:{self.column}" if self.line else self.file
 
 
 class Problem(NamedTuple):

@@ -64,7 +64,7 @@ def test_use_of_an_argument(right: str, wrong: str, found: tuple[str, float]) ->
     ("given", "said"),
     [
         ({"rate": "fast"}, ["robot.yaml:8:9: loop.rate: 'fast' is not a rate (argument rate:=fast); write a rate such as 50, 50 Hz or 1 kHz"]),
-        ({"prot": "sim", "x": "1"}, ["command line:1:1: argument prot:=sim is not declared in the robot file; did you mean port?", "command line:1:1: argument x:=1 is not declared in the robot file; known arguments: port, rate"]),
+        ({"prot": "sim", "x": "1"}, ["command line: argument prot:=sim is not declared in the robot file; did you mean port?", "command line: argument x:=1 is not declared in the robot file; known arguments: port, rate"]),
     ],
 )  # fmt: skip
 def test_wrong_argument_is_reported_where_it_is(given: dict[str, str], said: list[str]) -> None:
@@ -73,7 +73,7 @@ def test_wrong_argument_is_reported_where_it_is(given: dict[str, str], said: lis
 
 def test_without_a_block_there_are_no_arguments() -> None:
     first, second, *_ = desk.refusals("name: x\nloop: {rate: '${rate}'}\n", {"rate": "1"})
-    assert first.startswith("command line:1:1: argument rate:=1 is not declared in the robot file; remove it")
+    assert first.startswith("command line: argument rate:=1 is not declared in the robot file; remove it")
     assert "has no" in second
 
 

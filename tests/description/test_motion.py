@@ -52,7 +52,9 @@ def test_points_and_formulas_become_si_units() -> None:
 
 
 def test_a_part_that_is_neither_points_nor_formulas_is_refused() -> None:
-    assert len(desk.motion_refusals("name: x\nmotions: [{controller: a}]\n")) == 3
+    assert desk.motion_refusals("name: x\nmotions: [{controller: a}]\n") == [
+        "motion.yaml:2:11: motions[0] has no points; add `points: [{time: 0 s, joints: ...}]`"
+    ]
     assert desk.motion_refusals("name: x\nmotions: [5]\n") == [
         "motion.yaml:2:11: motions[0] is 5, but must be a mapping;"
         " write `key: value` lines below it, or {key: value, ...} after it"

@@ -154,7 +154,7 @@ def problems(text: str, *, model: type[BaseModel] | None = Parameters) -> list[s
         ("{joints: [a], gains: {a: {p: 1, d: 2}}}", ["f:2:40: controllers.arm.gains.a has an unknown key 'd'; remove it; known keys: p, i"]),
         ("{joints: [a], period: 2 s}", ["f:2:30: controllers.arm.period is the text '2 s', but must be a number or auto; write the number without a unit"]),
         ("{joints: [a], period: fast}", ["f:2:30: controllers.arm.period is the text 'fast', but must be a number or auto; write a number without quotes"]),
-        ("{joints: [a], shape: 5}", ["f:2:29: controllers.arm.shape is 5, but must be a mapping or a list; write `key: value` lines below it, or {key: value, ...} after it"]),
+        ("{joints: [a], shape: 5}", ["f:2:29: controllers.arm.shape is 5, but must be a mapping or a list; write `shape: {p: 5}`"]),
         ("{joints: [a], code: A1}", ["f:2:28: controllers.arm.code is the text 'A1', but must match ^[a-z]+$; correct it"]),
         ("{joints: [a], code: abcde}", ["f:2:28: controllers.arm.code is too long; write at most 4 characters"]),
     ],

@@ -15,9 +15,10 @@ from dxlrun.description.document import FilledScalar, KeyPath, Marks, literal, p
 from dxlrun.description.form_problems import problems_of
 from dxlrun.errors import Mark, Problem, suggestion
 
-COMMAND_LINE = "command line"  # file name in the mark of a problem of `name:=value`
+COMMAND_LINE = Mark("command line", 0, 0)  # place of a problem of `name:=value`
 
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*", re.ASCII)
+_OF_SHELL = re.compile(r"\$(?:\((?:arg )?)?(\w+)\)?")  # as in a shell, or a launch file of ROS
 _USE = re.compile(r"\$\$\{|\$\{([^{}]*)(\}?)")
 
 
@@ -71,7 +72,7 @@ class Arguments:
         for name in given:
             if name not in self._names:
                 what = f"argument {name}:={given[name]} is not declared in the robot file"
-                self.problems.append(Problem(Mark(COMMAND_LINE), what, _suggestion(name, self._names)))
+                self.problems.append(Problem(COMMAND_LINE, what, _suggestion(name, self._names)))
 
     def _declare(self, name: str, entry: object) -> None:
         path = ("arguments", name)
@@ -103,7 +104,7 @@ class Arguments:
     def insert_arguments(self, path: KeyPath, text: str, quoted: bool) -> FilledScalar:
         """Insert the arguments into a scalar of the file, at a path; return its value and its origin."""
         if "${" not in text:
-            return literal(path, text, quoted)
+            return self._without_arguments(path, text, quoted)
         if path[:1] == ("arguments",):
             if path[-1] == "help":
                 return literal(path, text, quoted)
@@ -118,6 +119,11 @@ class Arguments:
             return FilledScalar(self._values[names[0]], origin)
         filled = _USE.sub(lambda use: "${" if use[0] == "$${" else self.texts[use[1].strip()], text)
         return FilledScalar(filled if quoted else plain_value(filled), origin)
+
+    def _without_arguments(self, path: KeyPath, text: str, quoted: bool) -> FilledScalar:
+        if (shell := _OF_SHELL.fullmatch(text)) and shell[1] in self._names:
+            return _unusable(f"{text} is not an argument", f'write "${{{shell[1]}}}"')
+        return literal(path, text, quoted)
 
     def _wrong(self, use: re.Match[str]) -> list[tuple[str, str]]:
         name = use[1].strip()

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, BeforeValidator, Field
 
 from dxlrun.description.base_form import Form, ItemName, key, validation_error
 from dxlrun.description.units import AutoDuration, Duration, Rate
@@ -40,10 +40,22 @@ _LEAST_LATENCY_NS: Mapping[str, int] = MappingProxyType({"ftdi": 1_000_000, "dir
 """Latency of each kind of adapter, ns, if the file gives none (protocol.md, Time budget)."""
 
 
+_KINDS: Mapping[str, str] = MappingProxyType(
+    {"u2d2": "ftdi", "usb2dynamixel": "ftdi", "openrb_150": "direct", "opencr": "direct", "uart": "direct"}
+)
+"""Kind of each adapter whose name is often written instead; the boards have USB-CDC."""
+
+
+def _kind(value: object) -> object:
+    if isinstance(value, str) and (kind := _KINDS.get(value.lower().replace("-", "_"))):
+        raise validation_error(f"{value} is an adapter of the kind {kind}", f"write `kind: {kind}`")
+    return value
+
+
 class Adapter(Form):
     """Form of `adapter` of a bus: the USB or UART adapter between computer and servos."""
 
-    kind: Literal["ftdi", "direct"] | None = key(
+    kind: Annotated[Literal["ftdi", "direct"] | None, BeforeValidator(_kind)] = key(
         "Kind of adapter: with an FTDI chip and a latency timer of 1 ms (ftdi), or without a latency "
         "timer (direct).",
         "direct",
@@ -119,7 +131,7 @@ class Bus(Form):
         json_schema_extra={"enum": [1.0, 2.0]},
     )
     baud_rate: int = key("Baud rate, bit/s.", "1_000_000", gt=0, le=HIGHEST_BAUD_RATE)
-    adapter: Adapter = key("Properties of the adapter.", "{latency: 1 ms}", Adapter.of_defaults())
+    adapter: Adapter = key("Properties of the adapter.", "{kind: ftdi}", Adapter.of_defaults())
     return_delay_time: Duration = key(
         "Delay before a servo's reply, as in its item Return Delay Time.", "500 us", 500_000
     )

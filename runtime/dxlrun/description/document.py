@@ -273,7 +273,7 @@ _WORDS = (
     ),
     ("unexpected ':'", "this ':' is not allowed here", "write `key: value` with a space after the ':'"),
     ("entries are not allowed", "a list cannot start here", "start the list on a new line, or write [a, b]"),
-    ("unexpected end of stream", "this quote is not closed", "close it"),
+    ("unexpected end of stream", "this quote is not closed", "close it in its line"),
     ("expected ',' or", "a comma is missing here, inside the brackets{since}", "add it"),
     ("could not find expected ':'", "a key has no ':'", "write `key: value`"),
     (

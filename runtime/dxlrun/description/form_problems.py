@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Set
 from contextlib import suppress
 from types import UnionType
@@ -13,8 +14,9 @@ from pydantic_core import ErrorDetails
 
 from dxlrun.description.base_form import Mistakes
 from dxlrun.description.document import KeyPath, Marks, PlainDocument, plain_value, text_of
+from dxlrun.description.mistakes.forms import keys_for
 from dxlrun.description.mistakes.syntax import list_text
-from dxlrun.description.mistakes.words import Remedy, UnknownKeyContext
+from dxlrun.description.mistakes.words import Remedy, UnknownKeyContext, yaml_text
 from dxlrun.description.units import bound_text, example_of, units_of
 from dxlrun.errors import InputError, Mark, Problem, suggestion, what_and_fix
 from dxlrun.features import broken_features
@@ -338,7 +340,7 @@ def _merged(errors: list[_Error], marks: Marks) -> Problem:
         given = str(first.input) if first.units and first.kind in _BOUNDS else format_value(first.input)
         given += f" (argument {origin})" if origin else ""
         return Problem(
-            mark, f"{first.path_name} is {given}, but must be {' or '.join(expected)}", _remedy(first)
+            mark, f"{first.path_name} is {given}, but must be {' or '.join(expected)}", _remedy(first, marks)
         )
     what, fix = _sentence(first)
     if (origin := marks.origins.get(first.path)) is not None:
@@ -421,15 +423,16 @@ def _bound(value: object, error: _Error) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value).replace("'", "")
 
 
-def _remedy(error: _Error) -> str:
+def _remedy(error: _Error, marks: Marks) -> str:
     """Return the fix for a value of the wrong type or outside its range."""
     expected = _TYPES.get(error.kind, "")
-    if expected == "a list" and isinstance(error.input, str) and (items := list_text(error.input)):
+    if expected == "a list" and isinstance(error.input, str) and (items := _items(error.input, error, marks)):
         return f"write `{error.path[-1] if error.path else 'LIST'}: {items}`"
-    if expected in ("a mapping", "a list") and (fix := _indentation(error)):
+    if expected in ("a mapping", "a list") and (fix := _indentation(error) or _only_key(error)):
         return fix
     if error.kind in ("literal_error", "enum"):
-        return "write one of them"
+        options = re.findall(r"'([^']*)'", str(error.context["expected"]))
+        return suggestion(str(error.input), options, "write one of them")
     written = plain_value(error.input) if isinstance(error.input, str) else None
     if isinstance(written, int | float) and expected in (_WHOLE, _NUMBER, _BOOL):
         return "remove the quotes" if expected != _WHOLE or isinstance(written, int) else _REMEDIES[_WHOLE]
@@ -438,6 +441,35 @@ def _remedy(error: _Error) -> str:
     if isinstance(written, str) and expected in (_WHOLE, _NUMBER) and split_quantity(written):
         expected = _WITH_UNIT
     return _example(error) or _REMEDIES.get(expected, "correct it")
+
+
+def _items(text: str, error: _Error, marks: Marks) -> str:
+    """Return a text as the list that it means, such as `[pan, tilt]` for `pan, tilt`; else an empty text."""
+    if items := list_text(text):
+        return items
+    if re.fullmatch(r"\[.*\]", text):  # in quotes
+        return text
+    names = re.findall(r"[\w.]+", text)
+    at = None if error.model is None else _without_none(_annotation_at(error.model, (*error.location, 0)))
+    if at is not str or not re.fullmatch(r"[\w., ]+|\*", text):
+        return ""
+    if error.path[-1] == "joints" and text in ("all", "*"):
+        names = [str(path[1]) for path in marks.keys if path[0] == "joints" and len(path) == 2]
+    return f"[{', '.join(names)}]" if names else ""
+
+
+def _only_key(error: _Error) -> str:
+    """Return the fix for a value without its key, if only one key can be meant: `loop: 50`; else empty."""
+    form = None if error.model is None else _follow(error.model, error.location)
+    if form is None or error.input is None:
+        return ""
+    takes = keys_for(form, error.input)
+    meant = [name for name in takes if form.model_fields[name].is_required()]
+    if not meant and isinstance(error.input, str | list):  # many keys take a number
+        meant = takes
+    if len(meant) != 1:
+        return ""
+    return f"write `{error.path[-1]}: {{{meant[0]}: {yaml_text(error.input)}}}`"
 
 
 def _is_key_of_entry(error: _Error) -> bool:

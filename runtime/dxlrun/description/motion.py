@@ -135,7 +135,10 @@ class FormulaPart(Form):
 
 
 def _kind(part: object) -> str:
-    points = not isinstance(part, dict | FormulaPart) or (isinstance(part, dict) and "points" in part)
+    if isinstance(part, dict):
+        points = "points" in part or part.keys().isdisjoint(PointsPart.refused)
+    else:
+        points = not isinstance(part, FormulaPart)
     return "<points>" if points else "<formulas>"  # not a possible key, so an error's location is unambiguous
 
 
@@ -147,6 +150,11 @@ Part = Annotated[
 
 class MotionForm(Form):
     """Form of a motion file: a name, and parts for one or more controllers."""
+
+    refused: ClassVar[Mapping[str, str]] = dict.fromkeys(
+        ("controller", "start", "points", *PointsPart.refused),
+        "write it in a part: `motions: [{controller: head, points: [...]}]`",
+    )
 
     name: Name = key("Name of the motion.", "three_parts")
     motions: Annotated[tuple[Part, ...], Field(strict=False)] = key(

@@ -169,4 +169,4 @@ def _put(at: object, path: KeyPath, value: object) -> object:
 
 def _in_order(problems: Iterable[Problem]) -> list[Problem]:
     """Sort problems: those of the command line first, then by place in the file."""
-    return sorted(problems, key=lambda problem: (problem.mark.file != COMMAND_LINE, problem.mark))
+    return sorted(problems, key=lambda problem: (problem.mark != COMMAND_LINE, problem.mark))

@@ -175,7 +175,8 @@ def _mistakes(grown: PlainDocument) -> Iterator[Problem]:
             mark = grown.marks.value(GROUPS, name, "joints", index)
             if isinstance(joints, dict) and one not in joints and one not in entries:
                 what = f"joint {one} of group {name} is not defined"
-                yield Problem(mark, what, suggestion(one, (*joints, *entries)))
+                others = (each for each in entries if each != name)
+                yield Problem(mark, what, suggestion(one, (*joints, *others)))
             elif circle := _circle(entries, (name, one)):
                 what = f"the group {name} contains itself ({' -> '.join(circle)})"
                 yield Problem(mark, what, f"remove {one} from {name}")

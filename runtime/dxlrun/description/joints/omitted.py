@@ -15,7 +15,7 @@ from msgspec.structs import replace
 from dxlrun.description.arguments import COMMAND_LINE
 from dxlrun.description.document import KeyPath, Marks, PlainDocument, refusal
 from dxlrun.description.joints.groups import NAMING
-from dxlrun.errors import Mark, Problem
+from dxlrun.errors import Problem
 from dxlrun.features import installed_features, stages
 from dxlrun.features.feature import Section
 
@@ -65,7 +65,7 @@ def omit_joints(grown: PlainDocument, without: Sequence[str]) -> Omission:
     if not out:
         return Omission(grown)
     in_file = next((name for name in out if name in absent and name not in named), None)
-    mark = Mark(COMMAND_LINE) if in_file is None else grown.marks.value("joints", in_file, INSTALLED)
+    mark = COMMAND_LINE if in_file is None else grown.marks.value("joints", in_file, INSTALLED)
     if len(out) == len(joints):
         raise refusal(mark, "all joints are omitted", "omit fewer joints")
     remover = _Remover(out, joints)
@@ -235,7 +235,7 @@ class _Remover:
 def _refuse_unknown(without: Sequence[str], known: Sequence[str]) -> None:
     if wrong := [name for name in without if name not in known]:
         what = f"--without {', '.join(wrong)}: the robot has no such joint or group"
-        raise refusal(Mark(COMMAND_LINE), what, f"it has {', '.join(known)}")
+        raise refusal(COMMAND_LINE, what, f"it has {', '.join(known)}")
 
 
 def _parted(grown: PlainDocument, out: Sequence[str]) -> Iterator[Problem]:

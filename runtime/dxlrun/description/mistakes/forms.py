@@ -33,6 +33,11 @@ def places_of(root: type[BaseModel], key: str, value: object) -> list[Place]:
     ]
 
 
+def keys_for(form: type[BaseModel], value: object) -> list[str]:
+    """Return the keys of a model that accept a value."""
+    return [name for name in form.model_fields if _takes(_annotation(form, name), value)]
+
+
 def keys_of(root: type[BaseModel]) -> set[str]:
     """Return the names of all keys of a file's model, on every level."""
     return {place[-1] for place, _ in _all_places(root)}

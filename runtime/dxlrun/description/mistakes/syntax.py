@@ -1,7 +1,7 @@
-"""Syntax: explains YAML errors by unclosed brackets, missing colons and units behind lists.
+"""Syntax: explains YAML errors by unclosed brackets and quotes, missing colons and units behind lists.
 
 A YAML parser fails where it cannot continue, which is often far below the mistake. The indentation of the
-keys below shows which bracket is not closed.
+keys below shows which bracket is not closed, and a key inside a quote that the quote is not closed.
 """
 
 from __future__ import annotations
@@ -26,11 +26,20 @@ _RANGE = (
     rf"({_NUMBER})\s*({_UNIT})?\s*[\])]?\s*({_UNIT})?"
 )
 _MISSING_COLON = r"^ *[A-Za-z][\w-]*( )[{\[]"
+_EQUALS_SIGN = r"^ *(?:- +)?([A-Za-z][\w-]*) *(=) *([^\s=:][^:]*?)\s*$"
+_SLASHES = r"^[^#\"']*[\s}\]](//)\s"
+_TYPOGRAPHIC_QUOTE = r"^[^#]*?[:,{\[-] *([“”„‟«])"
 _BLOCK_SCALAR = r"(?:^|[ :-])[|>][-+0-9]*\s*$"
 
 
 class _OpenQuoteError(Exception):
-    """Raised if a quote is not closed, so that brackets after it cannot be judged."""
+    """Raised if a quote is not closed, so that brackets after it cannot be judged.
+
+    Its line and column are counted from 0.
+    """
+
+    def __init__(self, line: int, column: int) -> None:
+        self.line, self.column = line, column
 
 
 class _Bracket(msgspec.Struct, frozen=True):
@@ -45,7 +54,8 @@ class _Bracket(msgspec.Struct, frozen=True):
 def explain_syntax(text: str, file: str) -> list[Problem]:
     """Return problems with fixes for a text that is not YAML; empty if no known mistake is found."""
     lines = text.splitlines()
-    return [*_units_behind_lists(lines, file), *_missing_colons(lines, file)] or _open_brackets(lines, file)
+    found = [*_units_behind_lists(lines, file), *_foreign_signs(lines, file)]
+    return sorted(found, key=lambda problem: problem.mark) or _open_brackets(lines, file)
 
 
 def list_text(text: str) -> str:
@@ -78,11 +88,21 @@ def _units_behind_lists(lines: list[str], file: str) -> Iterator[Problem]:
             )
 
 
-def _missing_colons(lines: list[str], file: str) -> Iterator[Problem]:
+def _foreign_signs(lines: list[str], file: str) -> Iterator[Problem]:
+    """Yield a problem for each colon, comment or quote that is missing, or written as in other languages."""
     for number, line in enumerate(lines, 1):
         if match := re.search(_MISSING_COLON, line):
             mark = Mark(file, number, match.start(1) + 1)
             yield Problem(mark, "a colon is missing before this", "write `key: value`")
+        if match := re.search(_EQUALS_SIGN, line):
+            mark = Mark(file, number, match.start(2) + 1)
+            yield Problem(mark, "this = is not a colon", f"write `{match[1]}: {match[3]}`")
+        if match := re.search(_SLASHES, line):
+            mark = Mark(file, number, match.start(1) + 1)
+            yield Problem(mark, "// does not start a comment", "write # instead")
+        if match := re.search(_TYPOGRAPHIC_QUOTE, line):
+            mark = Mark(file, number, match.start(1) + 1)
+            yield Problem(mark, f"the quote {match[1]} is not a quote of YAML", 'write "')
 
 
 def _open_brackets(lines: list[str], file: str) -> list[Problem]:
@@ -91,8 +111,9 @@ def _open_brackets(lines: list[str], file: str) -> list[Problem]:
         if not _scanned(lines, file, by_keys=False) or _depth(lines) > _DEEPEST:
             return []
         return _scanned(lines, file, by_keys=True)
-    except _OpenQuoteError:
-        return []
+    except _OpenQuoteError as quote:
+        mark = Mark(file, quote.line + 1, quote.column + 1)
+        return [Problem(mark, "this quote is not closed", "close it in its line")]
 
 
 def _depth(lines: list[str]) -> int:
@@ -144,14 +165,16 @@ def _structure(lines: list[str]) -> Iterator[tuple[int, int, str, str]]:
     Each has line and column from 0, and the last character before it that is not a space. For a key at the
     beginning of a line the bracket is empty, and the column is the indentation of the key.
     """
-    quote = ""
+    quote, opened = "", (0, 0)
     block: int | None = None  # indentation of the line above a block scalar (`key: |`)
     for number, line in enumerate(lines):
         indentation = len(line) - len(line.lstrip(" "))
         if block is not None and (not line.strip() or indentation > block):
             continue
         block = indentation if re.search(_BLOCK_SCALAR, line) else None
-        if not quote and (key := re.match(_KEY, line)):
+        if key := re.match(_KEY, line):
+            if quote:  # few texts of several lines have a line like that
+                raise _OpenQuoteError(*opened)
             yield number, len(key[1]), "", ""
         escaped, before = False, ""
         for column, character in enumerate(line):
@@ -161,12 +184,12 @@ def _structure(lines: list[str]) -> Iterator[tuple[int, int, str, str]]:
             elif character == "#" and line[column - 1 : column] in ("", " "):
                 break
             elif character in "\"'" and before in ("", *":-[{,?"):
-                quote = character
+                quote, opened = character, (number, column)
             elif character in "[]{}":
                 yield number, column, character, before
             before = before if character == " " else character
     if quote:
-        raise _OpenQuoteError
+        raise _OpenQuoteError(*opened)
 
 
 def _not_closed(unclosed: list[_Bracket], lines: list[str], number: int, file: str) -> Problem:

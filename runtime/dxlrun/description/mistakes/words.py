@@ -141,9 +141,9 @@ class UnknownKeyContext(msgspec.Struct, frozen=True):
     def _said_of(self, meaning: _Meaning, word: str, value: object) -> str:
         """Return the fix for a foreign term: remove it, or write dxlrun's key."""
         if meaning.kind == "needless" and (
-            folded(word) != "type" or isinstance(value, int) or _yaml(value).lower() in _NEEDLESS
+            folded(word) != "type" or isinstance(value, int) or yaml_text(value).lower() in _NEEDLESS
         ):
-            return _NEEDLESS.get(_yaml(value).lower(), _NEEDLESS[meaning.place[0]])
+            return _NEEDLESS.get(yaml_text(value).lower(), _NEEDLESS[meaning.place[0]])
         if meaning.place[0] == "reference":
             return self._reference()
         return self._renamed(meaning, word, value)
@@ -207,7 +207,7 @@ class UnknownKeyContext(msgspec.Struct, frozen=True):
         elif key == "name" and named:
             fix = named
         elif folded(key) in _REMARKS and not near(key, self.known):
-            fix = f"write it as a comment: `# {_yaml(value)}`"
+            fix = f"write it as a comment: `# {yaml_text(value)}`"
         else:
             fix = ""
         return fix
@@ -221,7 +221,7 @@ class UnknownKeyContext(msgspec.Struct, frozen=True):
             return next((steps for steps, each in enumerate(same) if not each), min(len(place), len(here)))
 
         place = max(places, key=lambda place: (shared(place), -len(place)))
-        common, written = shared(place), f"{key}: {_yaml(value)}"
+        common, written = shared(place), f"{key}: {yaml_text(value)}"
         below = place[common:-1]
         if common == len(here) and below and NAME not in below:
             if below[0] in self.present:
@@ -288,12 +288,12 @@ def _in_mappings(keys: Place, written: str) -> str:
     return f"{keys[0]}: {{{_in_mappings(keys[1:], written)}}}" if keys else written
 
 
-def _yaml(value: object) -> str:
+def yaml_text(value: object) -> str:
     """Write a value as in a YAML file, cut off if it is long."""
     if isinstance(value, dict):
-        text = f"{{{', '.join(f'{key}: {_yaml(each)}' for key, each in value.items())}}}"
+        text = f"{{{', '.join(f'{key}: {yaml_text(each)}' for key, each in value.items())}}}"
     elif isinstance(value, list):
-        text = f"[{', '.join(map(_yaml, value))}]"
+        text = f"[{', '.join(map(yaml_text, value))}]"
     else:
         text = value if isinstance(value, str) else json.dumps(value)
     return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
@@ -317,8 +317,8 @@ def _plain(value: object, example: str) -> _Written:
         return None
     unit = _UNIT.fullmatch(example)
     if unit is not None and _is_number(value):
-        return f"{_yaml(value)} {unit[1]}", f", if the value is in {unit[1]}"
-    return (_yaml(value), "") if unit is None or isinstance(value, str) else None
+        return f"{yaml_text(value)} {unit[1]}", f", if the value is in {unit[1]}"
+    return (yaml_text(value), "") if unit is None or isinstance(value, str) else None
 
 
 def _limits_text(values: list[object], *, of_urdf: bool = False, length: str = "") -> _Written:
@@ -336,7 +336,7 @@ def _limits_text(values: list[object], *, of_urdf: bool = False, length: str = "
     turns = "rad" if in_rad and max(numbers, default=0) <= _TURN else "deg"
     unit = length or turns
     texts = [
-        name if value is None else f"{_yaml(value)} {unit}" if _is_number(value) else _yaml(value)
+        name if value is None else f"{yaml_text(value)} {unit}" if _is_number(value) else yaml_text(value)
         for value, name in zip(values, ("LOWER", "UPPER"), strict=True)
     ]
     return f"[{', '.join(texts)}]", f", if the values are in {unit}" if numbers and not of_urdf else ""
@@ -347,7 +347,7 @@ def _pair(value: object, example: str) -> _Written:
 
 
 def _direction(value: object, example: str) -> _Written:
-    word = _yaml(value).lower()
+    word = yaml_text(value).lower()
     return ("1", "") if word in _FORWARDS else ("-1", "") if word in _BACKWARDS else None
 
 
@@ -364,8 +364,19 @@ def _on_or_off(value: object, example: str) -> _Written:
     return ("on" if value in (True, 1, "on") else "off", "")
 
 
+def _targets(value: object, example: str) -> _Written:
+    if not isinstance(value, dict):
+        return None
+    targets = {name: one if isinstance(one, dict) else {"position": one} for name, one in value.items()}
+    return yaml_text(targets), ""
+
+
+def _point(value: object, example: str) -> _Written:
+    return f"[{{time: 2 s, pose: {yaml_text(value)}}}]", ""
+
+
 def _rate(value: object, example: str) -> _Written:
-    period = _PERIOD.fullmatch(_yaml(value))
+    period = _PERIOD.fullmatch(yaml_text(value))
     seconds = float(period[1]) * _SECONDS[period[2]] if period and period[1].count(".") <= 1 else 0.0
     return (f"{1 / seconds:.6g}", "") if seconds > 0 else None
 
@@ -376,5 +387,7 @@ _CONVERSIONS: Mapping[str, Callable[[object, str], _Written]] = {
     "drive_mode": _drive_mode,
     "pair": _pair,
     "period": _rate,
+    "pose": _point,
+    "targets": _targets,
     "torque": _on_or_off,
 }
