@@ -1,14 +1,11 @@
-"""Faults: a block of the lists has its parts, and is applied only where it fits."""
+"""Faults: a block of the lists has its parts, and is applied only where it fits; trials of them."""
 
-import gc
-import time
 from pathlib import Path
 
 import pytest
 from coverage import CoverageData
 from tests.faults import faults, trials
 from tests.faults.faults import Fault
-from tests.kit.loaded import loaded
 
 BLOCK = """runtime/dxlrun/errors.py: nothing is missing
 -     if not missing:
@@ -82,83 +79,63 @@ def test_fault_is_taken_back_however_its_tests_end(tmp_path: Path, monkeypatch: 
     assert product.read_text() == "a = 1\nb = 2\n"
 
 
-PRODUCT = """class Joint:
-    def __init__(self):
-        self.angle = 1
+PRODUCT = """limit = 1
 
-    @property
+class Joint:
     def goal(self):
-        return self.angle
+        return limit
 
-    @goal.setter
-    def goal(self, goal):
-        self.angle = goal
-
-def counter():
-    number = 0
-    def count():
-        nonlocal number
-        number += 1
-        return number
-    return count
+    def counter(self):
+        def count():
+            return limit + 1
+        return count
 """
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "goals", "counts"),
+    ("fault", "found"),
     [
-        ("self.angle = goal", "self.angle = -goal", (1, -5), (1, 2)),
-        ("return self.angle", "return 2 * self.angle", (2, 10), (1, 2)),
-        ("number += 1", "number += 3", (1, 5), (1, 4)),  # what counted before goes on with its own number
+        ("        return limit", ["goal[a|b]"]),
+        ("            return limit + 1", ["count"]),
+        ("        return count", ["count", "counter"]),
+        ("limit = 1", []),
     ],
 )
-def test_functions_that_are_in_use_get_the_fault(
-    tmp_path: Path, old: str, new: str, goals: tuple[int, int], counts: tuple[int, int]
+def test_tests_that_execute_a_faulty_function_are_those_of_coverage(
+    fault: str, found: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path = tmp_path / "product.py"
-    path.write_text(PRODUCT)
-    product = loaded(path)
-    joint, count = product.Joint(), product.counter()
-    seen = [count()]
-    gc.freeze()  # as commands do
-    assert trials.load(path, PRODUCT, PRODUCT.replace(old, new))
-    before, joint.goal = joint.goal, 5
-    assert (before, joint.goal) == goals
-    assert (*seen, count()) == counts
+    monkeypatch.setattr(faults, "ROOT", tmp_path)
+    (tmp_path / "product.py").write_text(PRODUCT)
+    covered = CoverageData(no_disk=True)
+    for line, name in ((5, "goal[a|b]|run"), (8, "counter|setup"), (9, "count|run"), (1, "")):
+        covered.set_context(f"tests/test_x.py::{name}" if name else "")
+        covered.add_lines({str(tmp_path / "product.py"): [line]})
+    names = trials.tests_executing(Fault("product.py", "it is wrong", fault, "", ""), covered)
+    assert names == [f"tests/test_x.py::{one}" for one in found]
+
+
+TESTS = """
+import time, product
+
+def test_without_the_fault_too():
+    assert False
+
+def test_limit():
+    time.sleep(1000.0 * (product.limit == 2))
+    assert product.limit == 1
+"""
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "can"),
-    [
-        ("number = 0", "number = 1", True),
-        ("class Joint:", "class Joint(Exception):", False),
-        ("def goal(self, goal):", "def goal(self, goal=0):", False),
-    ],
+    ("new", "limit_s", "result"), [(0, 600.0, "found by: test_product.py::test_limit"), (2, 0.5, "not found")]
 )
-def test_fault_outside_of_functions_needs_a_pytest_of_its_own(old: str, new: str, can: bool) -> None:
-    assert trials.is_loadable("product.py", PRODUCT, PRODUCT.replace(old, new)) is can
-
-
-def test_tests_that_execute_a_faulty_function_are_those_of_coverage(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_failure_counts_that_is_due_to_the_fault_and_comes_in_time(
+    new: int, limit_s: float, result: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(faults, "ROOT", tmp_path)
-    monkeypatch.setattr(trials, "ROOT", tmp_path)
-    (tmp_path / "product.py").write_text(PRODUCT)
-    covered = CoverageData(no_disk=True)
-    for line, name in ((7, "goal[a|b]|run"), (11, "angle|setup"), (17, "count|run"), (1, "")):
-        covered.set_context(f"tests/test_x.py::{name}" if name else "")
-        covered.add_lines({str(tmp_path / "product.py"): [line]})
-    fault = Fault("product.py", "it counts twice", "        number += 1", "        number += 2", "")
-    assert trials.trial_of(fault, covered).executing == {"tests/test_x.py::count"}
-    fault = Fault("product.py", "the angle", "        return self.angle", "        return 0", "")
-    assert trials.trial_of(fault, covered).executing == {"tests/test_x.py::goal[a|b]"}
-
-
-def test_what_takes_too_long_finds_nothing() -> None:
-    def last_word() -> list[str]:
-        time.sleep(60.0)
-        return ["late"]
-
-    assert trials.in_copy(lambda: ["tests/x.py::test_it"]) == ["tests/x.py::test_it"]
-    assert trials.in_copy(last_word, limit_s=0.2) == []
+    monkeypatch.setattr(trials, "LIMIT_S", limit_s)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "product.py").write_text("limit = 1\n")
+    (tmp_path / "test_product.py").write_text(TESTS)
+    fault = Fault("product.py", "it is wrong", "limit = 1", f"limit = {new}", "")
+    assert trials.result_of(fault, ["test_product.py"]) == result

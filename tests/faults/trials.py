@@ -1,32 +1,25 @@
-"""Trials: tests run for each fault, in a process of its own, until one of them fails.
+"""Trials: tests run for each fault, in a pytest of its own, until one of them fails.
 
     pytest --cov --cov-context=test --cov-report=    # once: .coverage has the tests that execute each line
     python tests/faults/faults.py --try control.txt
 
-The tests that execute a function of the fault in the process of pytest run; where there are none, those of
-its room, and those that name its module. pytest collects them once; for each fault a copy of that process
-(fork) gives the functions of the faulty file their new code, and what tests start themselves reads that file.
-A fault in C, or outside of functions, has a pytest of its own. A test that fails without the fault too has
-not found it, and what takes longer than the limit finds nothing: nobody would wait for it.
+The tests that execute the function of the fault in the process of pytest run; where there are none, those of
+its room, and those that name its module. A test that fails without the fault too has not found it, and what
+takes longer than the limit finds nothing: nobody would wait for it.
 """
 
 import ast
-import gc
-import inspect
-import itertools
 import multiprocessing
 import os
 import re
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import nullcontext
-from functools import cache, partial
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import cache
 from multiprocessing.connection import Connection
 from pathlib import Path
-from types import CodeType
-from typing import NamedTuple
 
 import pytest
 from coverage import CoverageData
@@ -34,9 +27,10 @@ from tests.faults import faults
 from tests.faults.faults import ROOT, Fault
 from tests.kit import selection
 
-LIMIT_S = 60.0
+LIMIT_S = 120.0
 FORK = multiprocessing.get_context("fork")
-NOT_LOADED = "not loaded"
+WORDS = ["-q", "-x", "-n", "0", "-p", "no:cacheprovider", "--timeout=120"]
+WORDS += ["-W", "ignore::pytest.PytestAssertRewriteWarning"]  # of plugins that this program has imported
 
 
 def tests_of(path: str) -> list[str]:
@@ -60,212 +54,100 @@ def short_files() -> dict[Path, str]:
     return {file: file.read_text("utf-8") for file in files if str(file.relative_to(ROOT)) not in long}
 
 
-class Trial(NamedTuple):
-    """A fault, and what decides which tests run for it."""
-
-    fault: Fault
-    right: str
-    """The file without the fault."""
-    wrong: str
-    """The file with the fault."""
-    executing: frozenset[str]
-    """Tests that execute a function of the fault in the process of pytest."""
-
-    @property
-    def files(self) -> list[str]:
-        """The test files that run, most likely ones first."""
-        own = tests_of(self.fault.path)
-        return [*own, *sorted({name.partition("::")[0] for name in self.executing} - {*own})]
-
-    def chosen(self, items: Sequence[pytest.Item]) -> list[pytest.Item]:
-        """Return the tests that run, most likely ones first."""
-        own = {*tests_of(self.fault.path)}
-        ranks = {file: rank for rank, file in enumerate(self.files)}
-        by_file = [(item.nodeid.partition("::")[0], item) for item in items]
-        if self.executing:
-            chosen = [(file, item) for file, item in by_file if item.nodeid in self.executing]
-        else:
-            chosen = [(file, item) for file, item in by_file if file in own]
-        return [item for _, item in sorted(chosen, key=lambda one: ranks[one[0]])]
-
-
-def trial_of(fault: Fault, covered: CoverageData) -> Trial:
-    right, wrong = faults.texts_of(fault)
-    lines: set[int] = set()
-    if is_loadable(fault.path, right, wrong):
-        codes, changed = ({*functions_of(compile(text, fault.path, "exec"))} for text in (right, wrong))
-        kept = {code for _, _, code in changed}
-        lines = {line for _, _, code in codes if code not in kept for *_, line in code.co_lines() if line}
-    by_line = covered.contexts_by_lineno(str(ROOT / fault.path))
+def tests_executing(fault: Fault, covered: CoverageData) -> list[str]:
+    """Return the tests that execute the function of a fault in the process of pytest, those of its room
+    first."""
+    if not fault.path.endswith(".py"):
+        return []
+    text, _ = faults.texts_of(fault)
+    first = text[: text.index(f"{fault.old}\n")].count("\n") + 1
+    around = [
+        node
+        for node in ast.walk(ast.parse(text))
+        if isinstance(node, ast.FunctionDef) and node.lineno <= first <= (node.end_lineno or 0)
+    ]
+    function = max(around, key=lambda node: node.lineno, default=None)
+    lines = range(function.body[0].lineno, (function.end_lineno or 0) + 1) if function else ()
+    by_line = covered.contexts_by_lineno(str(faults.ROOT / fault.path))
     names = {name.rpartition("|")[0] for line in lines for name in by_line.get(line, ())}
-    return Trial(fault, right, wrong, frozenset(names - {""}))
+    own = {*tests_of(fault.path)}
+    return sorted(names - {""}, key=lambda name: (name.partition("::")[0] not in own, name))
 
 
-def functions_of(code: CodeType) -> Iterator[tuple[str, int, CodeType]]:
-    """Yield name, first line and code of each function of a module, and of those inside of functions."""
-    for one in code.co_consts:
-        if isinstance(one, CodeType):
-            yield one.co_qualname, one.co_firstlineno, one
-            yield from functions_of(one)
-
-
-def outside_functions(text: str) -> str:
-    """Return a module without the bodies of its functions."""
-    tree = ast.parse(text)
-    for node in ast.walk(tree):
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-            node.body = []
-    return ast.dump(tree)
-
-
-def is_loadable(path: str, right: str, wrong: str) -> bool:
-    """Return whether a fault is in bodies of Python functions only."""
-    return path.endswith(".py") and outside_functions(right) == outside_functions(wrong)
-
-
-def load(path: Path, right: str, wrong: str) -> bool:
-    """Give the functions of this process the code of a faulty file; False if they cannot have it."""
-    rights, wrongs = (
-        [*functions_of(compile(text, path, "exec", dont_inherit=True))] for text in (right, wrong)
-    )
-    if [name for name, _, _ in rights] != [name for name, _, _ in wrongs]:
-        return False
-    codes = {(name, line): code for (name, line, _), (_, _, code) in zip(rights, wrongs, strict=True)}
-    gc.unfreeze()  # get_objects does not list what is frozen
-    for function in filter(inspect.isfunction, gc.get_objects()):
-        old = function.__code__
-        new = codes.get((old.co_qualname, old.co_firstlineno)) if old.co_filename == str(path) else None
-        if new is not None:
-            if old.co_freevars != new.co_freevars:
-                return False
-            function.__code__ = new
-    return True
-
-
-class Trials:
-    """Plugin: runs the collected tests for each fault, and sends the first that fails."""
-
-    def __init__(self, trials: Sequence[Trial], results: Connection, *, is_present: bool) -> None:
-        self._trials = trials
-        self._results = results
-        self._is_present = is_present
-
-    @pytest.hookimpl(tryfirst=True)
-    def pytest_runtestloop(self, session: pytest.Session) -> bool:
-        """Run the tests in a copy of this process for each fault."""
-        for trial in self._trials:
-            items = trial.chosen(session.items)
-            while True:
-                with nullcontext() if self._is_present else faults.applied(trial.fault):
-                    found = in_copy(partial(self._failure_of, session, items, trial))
-                alone = [item for item in items if item.nodeid in found]
-                if self._is_present or not alone or not in_copy(partial(failures, session, alone)):
-                    break
-                items.remove(alone[0])  # it fails without the fault too
-            self._results.send(found)
-        return True
-
-    def _failure_of(self, session: pytest.Session, items: Sequence[pytest.Item], trial: Trial) -> list[str]:
-        """Return the first test that fails with a fault in this process."""
-        path = ROOT / trial.fault.path
-        if not self._is_present and not load(path, trial.right, trial.wrong):
-            return [NOT_LOADED]
-        return failures(session, items)
-
-
-def in_copy(function: Callable[[], list[str]], limit_s: float = LIMIT_S) -> list[str]:
-    """Return what a function returns in a copy of this process; nothing if it takes too long."""
+def first_failure(tests: Sequence[str], *, omitted: Sequence[str] = ()) -> str:
+    """Run tests until one fails; return it, and nothing where none fails within the limit."""
     answer, question = FORK.Pipe(duplex=False)
-    if (copy := os.fork()) == 0:
-        os.setpgid(0, 0)
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        try:
-            question.send(function())
-        finally:
-            os._exit(0)
+    session = FORK.Process(target=run_session, args=(tests, omitted, question))
+    session.start()
     question.close()
     try:
-        return answer.recv() if answer.poll(limit_s) else []
+        if answer.poll(LIMIT_S):
+            return str(answer.recv())
+        os.kill(session.pid or 0, signal.SIGINT)  # lets the tests end what they started
+        session.join(20.0)
+        session.kill()
+        return ""
     except EOFError:
-        return ["pytest died"]
+        return "pytest died"
     finally:
-        os.kill(copy, signal.SIGINT)  # lets the tests end what they started
-        if not answer.poll(20.0):
-            os.killpg(copy, signal.SIGKILL)
-        os.waitpid(copy, 0)
+        session.join()
 
 
-def failures(session: pytest.Session, items: Sequence[pytest.Item]) -> list[str]:
-    """Run tests until one fails; return it."""
-    failed: list[str] = []
+class FirstFailure:
+    """Plugin: has the first test or file that failed."""
 
-    class Reports:
-        def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-            if report.failed:
-                failed.append(report.nodeid)
+    name = ""
 
-    session.config.pluginmanager.register(Reports())
-    for item, following in itertools.zip_longest(items, items[1:]):
-        item.config.hook.pytest_runtest_protocol(item=item, nextitem=following)
-        if failed:
-            session._setupstate.teardown_exact(None)
-            break
-    return failed
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        if report.failed:
+            self.name = self.name or report.nodeid
+
+    def pytest_collectreport(self, report: pytest.CollectReport) -> None:
+        if report.failed:
+            self.name = self.name or report.nodeid
 
 
-def run_session(trials: Sequence[Trial], results: Connection, *, is_present: bool) -> None:
-    """Collect and run the tests of faults in this process, without a word."""
+def run_session(tests: Sequence[str], omitted: Sequence[str], question: Connection) -> None:
+    """Run tests in this process, without a word, and send what failed first."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     with open(os.devnull, "w") as nowhere:
         os.dup2(nowhere.fileno(), 1)
         os.dup2(nowhere.fileno(), 2)
-    words = ["-q", "-n", "0", "-p", "no:cacheprovider", "--timeout=120"]
-    words += ["-W", "ignore::pytest.PytestAssertRewriteWarning"]  # of plugins that this program has imported
-    files = dict.fromkeys(file for trial in trials for file in trial.files if (ROOT / file).is_file())
-    pytest.main([*words, *files], plugins=[Trials(trials, results, is_present=is_present)])
+    failure = FirstFailure()
+    pytest.main([*WORDS, *tests, *(f"--deselect={test}" for test in omitted)], plugins=[failure])
+    question.send(failure.name)
 
 
-def results_of(trials: Sequence[Trial], *, is_present: bool) -> Iterator[Fault]:
-    """Yield faults with their results."""
-    answer, results = FORK.Pipe(duplex=False)
-    session = FORK.Process(target=run_session, args=(trials, results), kwargs={"is_present": is_present})
-    session.start()
-    results.close()
-    for trial in trials:
-        try:
-            found = answer.recv()
-        except EOFError:  # pytest ended before its tests: the fault shows when they are collected
-            found = ["collection of the tests" if is_present else NOT_LOADED]
-        yield trial.fault._replace(result=f"found by: {found[0]}" if found else "not found")
-    session.join()
-
-
-def build() -> None:
-    """Compile the C sources again."""
+@contextmanager
+def installed(fault: Fault) -> Iterator[None]:
+    """Apply a fault, and compile C sources again, before and at the end."""
+    is_compiled = fault.path.endswith(".c")
     command = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "-e", "."]
-    subprocess.run(command, cwd=ROOT, check=True)
+    try:
+        with faults.applied(fault):
+            if is_compiled:
+                subprocess.run(command, cwd=ROOT, check=True)
+            yield
+    finally:
+        if is_compiled:
+            subprocess.run(command, cwd=ROOT, check=True)
+
+
+def result_of(fault: Fault, tests: Sequence[str]) -> str:
+    """Return which of the tests finds a fault."""
+    failing: list[str] = []
+    while True:
+        with installed(fault):
+            found = first_failure(tests, omitted=failing)
+        if "::" not in found or not first_failure([found]):
+            return f"found by: {found}" if found else "not found"
+        failing.append(found)  # it fails without the fault too
 
 
 def tried(untried: Sequence[Fault]) -> Iterator[Fault]:
     """Yield faults with their results."""
     covered = CoverageData(str(ROOT / ".coverage"))
     covered.read()
-    alone = []
-    loadable = []
-    for trial in (trial_of(fault, covered) for fault in untried):
-        can = is_loadable(trial.fault.path, trial.right, trial.wrong)
-        (loadable if can else alone).append(trial)
-    for trial, fault in zip(loadable, results_of(loadable, is_present=False), strict=True):
-        if fault.result == f"found by: {NOT_LOADED}":
-            alone.append(trial)
-        else:
-            yield fault
-    for trial in alone:
-        is_compiled = trial.fault.path.endswith(".c")
-        try:
-            with faults.applied(trial.fault):
-                if is_compiled:
-                    build()
-                yield from results_of([trial], is_present=True)
-        finally:
-            if is_compiled:
-                build()
+    for fault in untried:
+        tests = tests_executing(fault, covered) or tests_of(fault.path)
+        yield fault._replace(result=result_of(fault, tests))
