@@ -87,7 +87,8 @@ def pair(chance: random.Random) -> int:
     rates = (chance.choice((57_600, 1_000_000, *EDGES)) for _ in range(BUSES))
     buses = [LoggedBus("", baud_rate=rate, return_delay_ns=chance.choice(EDGES)) for rate in rates]
     packets = random_packets(chance)
-    found = Pairing(tuple(buses)).alone(packets)
+    pairing = Pairing(tuple(buses))
+    found = pairing.alone(packets)
     due, replies = found.due, found.replies
     came = np.flatnonzero(due.reply >= 0)
     answers = due.reply[came]
@@ -97,6 +98,9 @@ def pair(chance: random.Random) -> int:
     assert due.missing.tolist() == np.flatnonzero(due.reply < 0).tolist()
     assert len(due.exchange) == found.requests.servos[found.request].sum()
     assert (found.count_due(np.arange(len(found.bus))) == np.bincount(due.servo, minlength=512)).all()
+    assert (pairing.counts.replies == np.bincount(replies.servo, minlength=512)).all()
+    took_ns = replies.last_ns - found.asked_ns[replies.exchange]
+    assert (replies.took_us == np.where(replies.answers, took_ns // 1000, 0)).all()
     last = np.full(len(found.bus), -1)
     last[replies.exchange[replies.answers]] = np.flatnonzero(replies.answers)
     assert found.answer.tolist() == last.tolist()

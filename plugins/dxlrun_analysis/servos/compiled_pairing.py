@@ -15,12 +15,14 @@ from numpy.typing import NDArray
 from dxlrun.tooling.compiled_code import load_compiled, parse_structs
 from dxlrun.tooling.logs import PacketColumns
 from dxlrun_analysis.plan_excerpt import LoggedBus
-from dxlrun_analysis.servos.logged_requests import DistinctRequests, Flags, Numbers
+from dxlrun_analysis.servos.logged_requests import IDS, DistinctRequests, Flags, Numbers
 from dxlwire import PacketKind
 
 SOURCE = Path(__file__).with_name("pairing.c")
+_BYTES = 256  # Values of an error byte
+_KINDS = max(PacketKind) + 1
 _STRUCTS = parse_structs(SOURCE.read_text())
-_ARGUMENTS = {"split": 4, "count_replies": 4, "pair_replies": 7}  # Number of arguments of each function
+_ARGUMENTS = {"split": 5, "count_replies": 4, "pair_replies": 8}  # Number of arguments of each function
 
 
 class ExchangeColumns(NamedTuple):
@@ -46,8 +48,9 @@ class Replies(NamedTuple):
     exchange: Numbers  # Index in the exchanges
     servo: Numbers
     place: Numbers  # Place in the replies that the instruction requests; -1: not requested
-    error: Numbers  # The error byte
-    protocol: Numbers
+    took_us: (
+        Numbers  # From before the write() of the instruction to `last_ns`; 0 for a reply that does not answer
+    )
     wire_ns: Numbers  # Wire time of the status packet
     last_ns: Numbers  # After the read() of the status packet's last byte
     before_ns: Numbers
@@ -73,11 +76,36 @@ class DueReplies(NamedTuple):
     missing: Numbers  # Rows without a reply, shape (missing replies,)
 
 
+class TrafficCounts(NamedTuple):
+    """Counters of the packets that were paired so far."""
+
+    packets: Numbers  # Packets of each kind, shape (buses, kinds)
+    bytes: Numbers  # Their bytes
+    instructions: Numbers  # Instructions with each ID; this and the next arrays have shape (servos,)
+    replies: Numbers
+    protocol: Numbers  # 1 or 2, of the last reply; 0 without one
+    longest_ns: Numbers  # Longest time from before the write() of an instruction to the requested reply
+    errors: Numbers  # Replies with each error byte but 0, shape (servos, 256)
+
+    @classmethod
+    def for_buses(cls, buses: int) -> TrafficCounts:
+        """Return counters of 0."""
+        packets, size = np.zeros((2, buses, _KINDS), np.int64)
+        instructions, replies, protocol, longest_ns = np.zeros((4, buses * IDS), np.int64)
+        errors = np.zeros((buses * IDS, _BYTES), np.int64)
+        return cls(packets, size, instructions, replies, protocol, longest_ns, errors)
+
+
 class CompiledPairing:
     """Some packets with the buses on which they were sent, as structs of the compiled functions."""
 
     def __init__(
-        self, packets: PacketColumns, rows: Numbers, buses: Sequence[LoggedBus], free_ns: Numbers
+        self,
+        packets: PacketColumns,
+        rows: Numbers,
+        buses: Sequence[LoggedBus],
+        free_ns: Numbers,
+        counts: TrafficCounts,
     ) -> None:
         """Prepare for the packets in `rows`, which are sorted by bus, then by time.
 
@@ -86,6 +114,7 @@ class CompiledPairing:
             rows: Their rows in the order in which they are to be paired.
             buses: Buses of the log.
             free_ns: Time at which the line of each bus has carried everything that was sent; it is updated.
+            counts: Counters, which are increased.
         """
         self._count, self._instructions = len(rows), int((packets.kind[rows] == PacketKind.INSTRUCTION).sum())
         self._kept: list[object] = []  # Arrays of which the structs have the addresses
@@ -100,6 +129,7 @@ class CompiledPairing:
         }
         self._buses = self._structure("Buses", {**settings, "free_ns": free_ns}, count=len(buses))
         self._size = self._instructions + len(buses)
+        self._counts = self._structure("TrafficCounts", counts._asdict(), kinds=_KINDS)
 
     def _structure(self, name: str, columns: Mapping[str, NDArray[Any]], **numbers: int) -> ctypes.Structure:
         self._kept.append(columns)
@@ -111,14 +141,18 @@ class CompiledPairing:
         A request of several servos is -1 minus the index of an exchange with the same instruction.
 
         Raises:
-            ValueError: A packet is on none of the buses, or not inside the bytes of the packets.
+            ValueError: A packet is on none of the buses, not inside the bytes of the packets, or of
+                an unknown kind.
         """
         found = ExchangeColumns(*np.empty((len(ExchangeColumns._fields), self._size), np.int64))
         exchange = np.empty(self._count, np.int64)
         split = _library().pairing_split
         structure = self._structure("Exchanges", found._asdict(), count=self._size)
-        if split(byref(self._packets), byref(self._buses), byref(structure), exchange.ctypes.data):
-            raise ValueError("packets are not sorted by bus, or end after their bytes")
+        structures = map(byref, (self._packets, self._buses, structure))
+        if split(*structures, exchange.ctypes.data, byref(self._counts)):
+            raise ValueError(
+                "packets are not sorted by bus, end after their bytes, or are of an unknown kind"
+            )
         return found, exchange
 
     def pair_replies(
@@ -139,7 +173,7 @@ class CompiledPairing:
         packets, buses, kinds = byref(self._packets), byref(self._buses), byref(table)
         columns = byref(self._structure("Exchanges", exchanges._asdict(), count=self._size))
         count = library.pairing_count_replies(packets, kinds, columns, exchange.ctypes.data)
-        replies = Replies(*np.empty((9, count), np.int64), *np.empty((2, count), np.bool_))
+        replies = Replies(*np.empty((8, count), np.int64), *np.empty((2, count), np.bool_))
         count = int(requests.servos[exchanges.request].sum())
         of, servo, place, reply, loss, rows = np.empty((6, count), np.int64)
         due = DueReplies(of, servo, place, reply, loss, np.empty(count, np.bool_), rows)
@@ -147,6 +181,7 @@ class CompiledPairing:
             *(packets, buses, kinds, columns, exchange.ctypes.data),
             byref(self._structure("Replies", replies._asdict())),
             byref(self._structure("DueReplies", due._asdict())),
+            byref(self._counts),
         )
         return replies, due._replace(missing=due.missing[:missing].copy())
 

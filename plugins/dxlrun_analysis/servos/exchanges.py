@@ -16,7 +16,13 @@ from dxlrun import Log
 from dxlrun.tooling.logs import PacketColumns
 from dxlrun_analysis.cycles.punctuality import DISORDER_NS
 from dxlrun_analysis.plan_excerpt import LoggedBus, plan_of
-from dxlrun_analysis.servos.compiled_pairing import CompiledPairing, DueReplies, ExchangeColumns, Replies
+from dxlrun_analysis.servos.compiled_pairing import (
+    CompiledPairing,
+    DueReplies,
+    ExchangeColumns,
+    Replies,
+    TrafficCounts,
+)
 from dxlrun_analysis.servos.logged_requests import IDS, DistinctRequests, Flags, Numbers, RequestTable
 from dxlwire import BROADCAST_ID, PacketKind
 
@@ -112,9 +118,14 @@ class Pairing:
         Args:
             buses: Buses of the log as its plan describes them; without them, those of the first slice.
         """
-        self.buses = buses  # Buses of the log, as its plan describes them
         self._waiting: list[PacketColumns] = []
+        self._oldest_ns: int | None = None  # Time of the first waiting packet
         self._requests = RequestTable()
+        self._prepare(buses)
+
+    def _prepare(self, buses: tuple[LoggedBus, ...]) -> None:
+        self.buses = buses  # Buses of the log, as its plan describes them
+        self.counts = TrafficCounts.for_buses(len(buses))
         self._free_ns = np.zeros(len(buses), np.int64)
         """Time at which the line of each bus has carried everything that was sent."""
 
@@ -126,13 +137,14 @@ class Pairing:
         """
         if not self.buses:
             planned = plan_of(log).by_name
-            self.buses = tuple(planned.get(name, LoggedBus(name)) for name in log.buses)
-            self._free_ns = np.zeros(len(self.buses), np.int64)
+            self._prepare(tuple(planned.get(name, LoggedBus(name)) for name in log.buses))
         if not len(log.packets):
             return None
         self._waiting.append(log.packets)
         newest_ns = int(log.packets.first_ns[-1])
-        if newest_ns - int(self._waiting[0].first_ns[0]) <= 2 * DISORDER_NS:
+        if self._oldest_ns is None:
+            self._oldest_ns = int(log.packets.first_ns[0])
+        if newest_ns - self._oldest_ns <= 2 * DISORDER_NS:
             return None
         packets = PacketColumns.joined(self._waiting)
         order = _order(packets)
@@ -142,8 +154,13 @@ class Pairing:
         last = np.full(IDS, len(packets), np.int64)
         last[bus[instructions]] = instructions
         certain &= np.arange(len(packets)) < last[bus]
-        self._waiting = [packets.select_rows(order[~certain]).compact()]
-        return self._paired(packets, order[certain])
+        rows, held = order[certain], np.ones(len(packets), np.bool_)
+        held[rows] = False
+        self._oldest_ns = int(packets.first_ns[order[np.argmin(certain)]])
+        each = np.split(held, np.cumsum([len(part) for part in self._waiting[:-1]]))
+        parts = zip(self._waiting, each, strict=True)
+        self._waiting = [part.select_rows(mine) for part, mine in parts if mine.any()]
+        return self._paired(packets, rows)
 
     def pair_remaining(self) -> Exchanges | None:
         """Return the exchanges of the packets that were held back, or None; no more slices follow."""
@@ -162,7 +179,7 @@ class Pairing:
     def _paired(self, packets: PacketColumns, rows: Numbers, *, final: bool = False) -> Exchanges:
         """Pair the packets in `rows`, which are sorted by bus and time; `final` if no packets follow."""
         buses = len(self.buses)
-        compiled = CompiledPairing(packets, rows, self.buses, self._free_ns)
+        compiled = CompiledPairing(packets, rows, self.buses, self._free_ns, self.counts)
         columns, exchange = compiled.split_packets()
         self._requests.replace_samples(packets, columns.row, columns.request)
         replies, due = compiled.pair_replies(columns, exchange, self._requests.all)

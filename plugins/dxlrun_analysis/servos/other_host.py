@@ -57,7 +57,8 @@ class OtherHosts:
         self._unasked.count_values(exchanges.unasked // IDS, exchanges.unasked % IDS)
         second = np.array([bus.protocol != protocol1.PROTOCOL for bus in exchanges.buses], np.bool_)
         stray = exchanges.stray
-        self._pieces.count_values(*_ends(stray, second[stray.bus]))
+        if len(stray):
+            self._pieces.count_values(*_ends(stray, second[stray.bus]))
         for counts, buses in (
             (self._stray, stray.bus),
             (self._lost, due.servo[due.missing[np.isin(due.loss[due.missing], _LOST)]] // IDS),

@@ -13,6 +13,7 @@
 #endif
 
 #define IDS 256
+#define BYTES 256 /* values of an error byte */
 #define BROADCAST_ID 254
 #define BYTE_NS 10000000000 /* wire time of a byte times the rate in bit/s: ten bits a byte */
 #define RECENT 16           /* requests with which another one is compared: a robot has few */
@@ -49,7 +50,7 @@ typedef struct { /* columns of `Exchanges`, and: */
 } Exchanges;
 
 typedef struct { /* columns of `Replies` */
-    int64_t *exchange, *servo, *place, *error, *protocol, *wire_ns, *last_ns, *before_ns, *due_ns;
+    int64_t *exchange, *servo, *place, *took_us, *wire_ns, *last_ns, *before_ns, *due_ns;
     uint8_t *answers, *strange;
 } Replies;
 
@@ -58,6 +59,12 @@ typedef struct { /* columns of `DueReplies`, and the rows without a reply */
     uint8_t *broken;
     int64_t *missing;
 } DueReplies;
+
+typedef struct { /* columns of `TrafficCounts` */
+    int64_t *packets, *bytes; /* by bus and kind */
+    int64_t *instructions, *replies, *protocol, *longest_ns, *errors;
+    int64_t kinds;
+} TrafficCounts;
 
 uint32_t dxl_source(void)
 {
@@ -134,8 +141,9 @@ static void read_instruction(const Packets *packets, const Exchanges *found, int
 }
 
 /* Split packets into exchanges: one of each bus without an instruction, then one for each instruction. `exchange` gets
- * that of each packet. Return 0, or -1 for packets that are not sorted by bus or not within `data`. */
-int64_t pairing_split(const Packets *packets, const Buses *buses, const Exchanges *found, int64_t *exchange)
+ * that of each packet. Return 0, or -1 for packets that are not sorted by bus, not within `data`, or of an unknown kind. */
+int64_t pairing_split(const Packets *packets, const Buses *buses, const Exchanges *found, int64_t *exchange,
+    const TrafficCounts *counts)
 {
     int64_t recent[RECENT], seen = 0, at = -1, bus = -1;
     int64_t free_ns = 0, carried_ns = 0, latest_ns = 0;
@@ -156,12 +164,15 @@ int64_t pairing_split(const Packets *packets, const Buses *buses, const Exchange
             break;
         }
         int64_t length = packets->length[row], start = packets->start[row];
-        if (length < 0 || start < 0 || length > packets->bytes || start > packets->bytes - length) {
+        if (length < 0 || start < 0 || length > packets->bytes || start > packets->bytes - length ||
+            packets->kind[row] >= counts->kinds) {
             return -1;
         }
+        counts->packets[bus * counts->kinds + packets->kind[row]]++;
+        counts->bytes[bus * counts->kinds + packets->kind[row]] += length;
         if (packets->kind[row] == INSTRUCTION) {
             int64_t wire = wire_ns(buses, packets, row), first_ns = packets->first_ns[row];
-            at++;
+            at++, counts->instructions[bus * IDS + packets->servo_id[row]]++;
             found->bus[at] = bus, found->cycle[at] = packets->cycle[row], found->row[at] = row;
             found->asked_ns[at] = first_ns, found->noise[at] = 0;
             int64_t took_ns = minus(packets->last_ns[row], first_ns);
@@ -216,7 +227,8 @@ int64_t pairing_count_replies(
 
 /* Fill in the replies, the requested replies, `last_ns` and `answer` of the exchanges. Return the number of missing replies. */
 int64_t pairing_pair_replies(const Packets *packets, const Buses *buses, const Requests *requests,
-    const Exchanges *exchanges, const int64_t *exchange, const Replies *replies, const DueReplies *due)
+    const Exchanges *exchanges, const int64_t *exchange, const Replies *replies, const DueReplies *due,
+    const TrafficCounts *counts)
 {
     int64_t next = 0, reply = 0, begin = 0, lacking = 0;
     for (int64_t at = 0; at < exchanges->count; at++) {
@@ -243,17 +255,23 @@ int64_t pairing_pair_replies(const Packets *packets, const Buses *buses, const R
                     int64_t begins = requests->blocks[request * requests->widest + block];
                     error = byte_at(packets, row, begins), servo_id = byte_at(packets, row, begins + 1);
                 }
-                int64_t place = requests->places[request * IDS + servo_id];
-                replies->exchange[reply] = at, replies->servo[reply] = bus * IDS + servo_id;
-                replies->place[reply] = place, replies->error[reply] = error;
-                replies->protocol[reply] = second ? 2 : 1, replies->wire_ns[reply] = wire;
+                int64_t place = requests->places[request * IDS + servo_id], servo = bus * IDS + servo_id;
+                replies->exchange[reply] = at, replies->servo[reply] = servo;
+                replies->place[reply] = place, replies->wire_ns[reply] = wire, replies->took_us[reply] = 0;
                 replies->last_ns[reply] = packets->last_ns[row], replies->before_ns[reply] = before_ns;
                 replies->due_ns[reply] = due_ns;
                 replies->strange[reply] = place < 0 && in_time && blocks < 0;
                 /* The first of several replies of a servo counts. */
                 int answers = place >= 0 && in_time && due->reply[begin + place] < 0;
                 replies->answers[reply] = (uint8_t)answers;
+                counts->replies[servo]++, counts->protocol[servo] = second ? 2 : 1;
+                if (error) {
+                    counts->errors[servo * BYTES + error]++;
+                }
                 if (answers) {
+                    int64_t took_ns = minus(packets->last_ns[row], exchanges->asked_ns[at]);
+                    counts->longest_ns[servo] = larger(counts->longest_ns[servo], took_ns);
+                    replies->took_us[reply] = took_ns / 1000 - (took_ns % 1000 < 0);
                     due->reply[begin + place] = exchanges->answer[at] = reply, missing--;
                 }
                 last_ns = larger(last_ns, packets->last_ns[row]);

@@ -23,9 +23,6 @@ from dxlrun_analysis.servos.other_host import OtherHosts
 from dxlrun_analysis.servos.reply_times import ReplyTimes
 from dxlwire import BROADCAST_ID, PacketKind, protocol1, protocol2
 
-_BYTES = 256  # Values of an error byte
-_KINDS = max(PacketKind) + 1
-
 
 @dataclass(frozen=True, slots=True)
 class ServoTraffic:
@@ -94,14 +91,8 @@ class Traffic:
     def _size(self, buses: int, states: JointStates) -> None:
         self._states, self._losses, self._reply_times = states, Losses(states), ReplyTimes(buses)
         self._broken, self._others = BrokenReplies(buses), OtherHosts(buses)
-        servos = buses * IDS
-        self._packets, self._bytes = (np.zeros((buses, _KINDS), np.int64) for _ in range(2))
-        self._instructions, self._asked, self._lost, self._replies, self._reply_max_ns = (
-            np.zeros(servos, np.int64) for _ in range(5)
-        )
-        self._protocol = np.ones(servos, np.int64)
-        self._seen = np.zeros(servos, np.bool_)
-        self._errors = np.zeros((servos, _BYTES), np.int64)  # By error byte; 0 is not counted
+        self._asked, self._lost = np.zeros((2, buses * IDS), np.int64)
+        self._seen = np.zeros(buses * IDS, np.bool_)
 
     def add_slice(self, log: Log) -> None:
         """Count the packets of the next slice of the log.
@@ -109,18 +100,8 @@ class Traffic:
         Raises:
             LogError: A packet cannot be read.
         """
-        if len(self._packets) != len(log.buses):
+        if len(self._seen) != len(log.buses) * IDS:
             self._size(len(log.buses), JointStates(log.buses, log.joints, plan_of(log)))
-        packets = log.packets
-        if len(packets):
-            kind = packets.bus.astype(np.int64) * _KINDS + packets.kind
-            shape = self._packets.shape
-            self._packets += np.bincount(kind, minlength=self._packets.size).reshape(shape)
-            size = np.bincount(kind, packets.length, self._packets.size)
-            self._bytes += size.astype(np.int64).reshape(shape)
-            sent = packets.kind == PacketKind.INSTRUCTION
-            servo = packets.bus[sent].astype(np.int64) * IDS + packets.servo_id[sent]
-            self._instructions += np.bincount(servo, minlength=len(self._instructions))
         exchanges = self._pairing.pair_packets(log)
         self._states.add_states(log)
         for event in log.events:
@@ -130,9 +111,10 @@ class Traffic:
     def summarize_traffic(self) -> tuple[tuple[ServoTraffic, ...], tuple[BusTraffic, ...]]:
         """Return the traffic of each servo and of each bus, and complete `findings`."""
         self._count(self._pairing.pair_remaining(), final=True)
-        addressed = self._instructions.copy()
-        addressed[BROADCAST_ID::IDS] = 0
-        servos = np.flatnonzero(self._seen | (addressed > 0)).tolist()
+        counts = self._pairing.counts
+        addressed = counts.instructions > 0
+        addressed[BROADCAST_ID::IDS] = False
+        servos = np.flatnonzero(self._seen | addressed | (counts.replies > 0)).tolist()
         plans = self._pairing.buses
         losses = self._losses.count_losses()
         found = tuple(replace(self._servo(servo), losses=losses.get(divmod(servo, IDS))) for servo in servos)
@@ -180,36 +162,20 @@ class Traffic:
         count, due, replies = len(self._asked), exchanges.due, exchanges.replies
         # A request that is open at the end of the log may have been answered later.
         ended = exchanges.ended[due.exchange[due.missing]]
-        asked, others = exchanges.count_due(np.arange(len(exchanges.bus))), np.flatnonzero(~replies.answers)
-        missing, unanswered, more, opened = (
-            np.bincount(servo, minlength=count)
-            for servo in (
-                due.servo[due.missing],
-                due.servo[due.missing[ended]],
-                replies.servo[others],
-                due.servo[due.missing[~ended]],
-            )
-        )
-        self._asked += asked - opened
-        self._lost += unanswered
-        self._replies += asked - missing + more
-        self._seen |= (asked > 0) | (more > 0)
-        self._protocol[replies.servo] = replies.protocol  # The last reply of a servo counts
-        rows = np.flatnonzero(replies.error)
-        np.add.at(self._errors, (replies.servo[rows], replies.error[rows]), 1)
+        asked = exchanges.count_due(np.arange(len(exchanges.bus)))
+        self._seen |= asked > 0
+        self._asked += asked - np.bincount(due.servo[due.missing[~ended]], minlength=count)
+        self._lost += np.bincount(due.servo[due.missing[ended]], minlength=count)
         answers = np.flatnonzero(replies.answers)
-        servo, of = replies.servo[answers], replies.exchange[answers]
-        took_ns = replies.last_ns[answers] - exchanges.asked_ns[of]
-        self._reply_us.count_values(servo, took_ns // 1000)
-        slower = took_ns > self._reply_max_ns[servo]
-        np.maximum.at(self._reply_max_ns, servo[slower], took_ns[slower])
+        self._reply_us.count_values(replies.servo[answers], replies.took_us[answers])
         rows, extra_ns = complete
         self._extra_us.count_values(exchanges.bus[rows], np.maximum(extra_ns, 0) // 1000)
 
     def _servo(self, index: int) -> ServoTraffic:
         bus, servo_id = self._pairing.buses[index // IDS], index % IDS
         names, devices = bus.names, {device.servo_id for device in bus.devices}
-        errors = self._errors[index]
+        counts = self._pairing.counts
+        errors = counts.errors[index]
         found = set(np.flatnonzero(errors).tolist())
         times = self._reply_us.counts_of(index)
         return ServoTraffic(
@@ -217,23 +183,24 @@ class Traffic:
             servo_id=servo_id,
             joint=names.get(servo_id, ""),
             device=servo_id in devices,
-            instructions=0 if servo_id == BROADCAST_ID else int(self._instructions[index]),
+            instructions=0 if servo_id == BROADCAST_ID else int(counts.instructions[index]),
             asked=int(self._asked[index]),
             lost=int(self._lost[index]),
-            replies=int(self._replies[index]),
+            replies=int(counts.replies[index]),
             errors=int(errors.sum()),
-            error_names=error_names(int(self._protocol[index]), found),
+            error_names=error_names(int(counts.protocol[index]), found),
             reply_median_us=median(*times),
-            reply_max_us=int(self._reply_max_ns[index]) / 1e3,
+            reply_max_us=int(counts.longest_ns[index]) / 1e3,
             reply_p99_us=quantile(*times, 0.99),
         )
 
     def _bus(self, index: int, plan: LoggedBus) -> BusTraffic:
-        packets, size = self._packets[index].tolist(), self._bytes[index].tolist()
+        counts = self._pairing.counts
+        packets, size = counts.packets[index].tolist(), counts.bytes[index].tolist()
         return BusTraffic(
             name=plan.name,
             instructions=packets[PacketKind.INSTRUCTION],
-            broadcasts=int(self._instructions[index * IDS + BROADCAST_ID]),
+            broadcasts=int(counts.instructions[index * IDS + BROADCAST_ID]),
             replies=packets[PacketKind.STATUS],
             noise_bytes=size[PacketKind.NOISE],
             bytes_out=size[PacketKind.INSTRUCTION],
