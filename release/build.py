@@ -67,6 +67,15 @@ def compiling_for(platform: str, cache: Path) -> dict[str, str]:
     return {**os.environ, **environment, "CC": shlex.join(compiler)}
 
 
+def build_sdist(root: Path, dist: Path, place: Path) -> tuple[Path, Path]:
+    """Build the sdist of a tree, and unpack it into an empty folder. Returns the file and the tree in it."""
+    sdist = dist / Path(run("hatchling", "build", "-t", "sdist", "-d", dist, folder=root).split()[-1]).name
+    # tarfile has its filters, without which 3.12 warns, since 3.11.4.
+    subprocess.run([str(shutil.which("tar")), "-xf", sdist, "-C", place], check=True)
+    (unpacked,) = place.iterdir()
+    return sdist, unpacked
+
+
 def build(root: Path, dist: Path, platforms: Collection[str] = PLATFORMS) -> list[Path]:
     """Build the sdist of a tree, and wheels of that sdist.
 
@@ -77,11 +86,8 @@ def build(root: Path, dist: Path, platforms: Collection[str] = PLATFORMS) -> lis
         RuntimeError: A build failed.
     """
     dist = dist.resolve()
-    sdist = dist / Path(run("hatchling", "build", "-t", "sdist", "-d", dist, folder=root).split()[-1]).name
     with tempfile.TemporaryDirectory() as made, ThreadPoolExecutor(os.cpu_count()) as several:
-        # tarfile has its filters, without which 3.12 warns, since 3.11.4.
-        subprocess.run([str(shutil.which("tar")), "-xf", sdist, "-C", made], check=True)
-        (unpacked,) = Path(made).iterdir()
+        sdist, unpacked = build_sdist(root, dist, Path(made))
         wheel = partial(run, "hatchling", "build", "-t", "wheel", "-d", dist)
         environments = [compiling_for(platform, Path(made, "cache")) for platform in platforms]
         printed = [

@@ -60,27 +60,24 @@ def release() -> ModuleType:
     return loaded(ROOT / "release/build.py")
 
 
-def tree(place: Path, umask: int = 0o022) -> Path:
-    """A copy of what a clone has."""
-    listed = ["git", "ls-files", "--cached", "--others", "--exclude-standard"]
-    names = subprocess.run(listed, cwd=ROOT, capture_output=True, text=True, check=False).stdout.split("\n")
-    folders = [path.name for path in ROOT.iterdir() if path.name not in {".git", ".venv", "dist", "logs"}]
-    for name in filter(None, names if any(names) else folders):
-        source, target = ROOT / name, place / name
-        target.parent.mkdir(parents=True, exist_ok=True)
-        if source.is_dir():
-            shutil.copytree(source, target, ignore=shutil.ignore_patterns("__pycache__", "*.so"))
-        elif source.is_file():
-            shutil.copyfile(source, target)
-            target.chmod(0o666 & ~umask)
-    return place
+@pytest.fixture(scope="module")
+def clone(release: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What the sdist has of this tree, without what CI puts into the tree."""
+    unpacked: Path
+    _, unpacked = release.build_sdist(ROOT, *map(tmp_path_factory.mktemp, ("sdist", "clone")))
+    return unpacked
 
 
 @pytest.fixture(scope="module")
-def built(release: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    root = tree(tmp_path_factory.mktemp("tree") / "dxlrun")
-    files: list[Path] = release.build(root, root / "dist")
+def built(release: ModuleType, clone: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    files: list[Path] = release.build(clone, tmp_path_factory.mktemp("dist"))
     return files
+
+
+def copy_for_owner(source: str, target: str) -> None:
+    """Copy a file that others may not read then; a program stays one."""
+    shutil.copyfile(source, target)
+    Path(target).chmod(Path(source).stat().st_mode & 0o700)
 
 
 def test_each_platform_has_a_wheel_with_its_tag_and_the_version(
@@ -143,9 +140,11 @@ def test_no_object_needs_a_newer_system_than_its_tag_names(built: list[Path]) ->
                     assert (needed, versions) == (set(), [])
 
 
-def test_the_same_tree_gives_the_same_bytes(release: ModuleType, built: list[Path], tmp_path: Path) -> None:
+def test_the_same_tree_gives_the_same_bytes(
+    release: ModuleType, clone: Path, built: list[Path], tmp_path: Path
+) -> None:
     """In another folder, with other permissions, and with a cache of zig's own that is empty."""
-    root = tree(tmp_path / "another" / "folder", umask=0o077)
+    root = shutil.copytree(clone, tmp_path / "another" / "folder", copy_function=copy_for_owner)
     again = release.build(root, tmp_path / "dist", ["manylinux_2_17_x86_64", "musllinux_1_2_aarch64"])
     first = {path.name: path.read_bytes() for path in built}
     assert len(again) == 4

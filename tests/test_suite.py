@@ -3,6 +3,7 @@
 import ast
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tarfile
@@ -22,11 +23,11 @@ ROOT = Path(__file__).parents[1]
 SHIPPED = ("docs", "plugins", "release", "robots", "runtime", "tests")
 
 
-def run(*words: str) -> subprocess.CompletedProcess[str]:
+def run(*words: str, folder: Path = ROOT) -> subprocess.CompletedProcess[str]:
     """Run this interpreter without the options of the tests' own run."""
     environment = {key: value for key, value in os.environ.items() if not key.startswith(("PYTEST", "COV_"))}
     words = (sys.executable, *words)
-    return subprocess.run(words, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+    return subprocess.run(words, cwd=folder, env=environment, capture_output=True, text=True, check=False)
 
 
 def test_every_test_has_a_limit(pytestconfig: pytest.Config) -> None:
@@ -277,6 +278,21 @@ def test_sdist_has_every_file_of_its_folders(built: Path) -> None:
     # the kernel is compiled where the package is installed
     files = {path.relative_to(ROOT) for path in found if path.suffix != ".so" and not made & set(path.parts)}
     assert {str(path) for path in files} - packed == set()
+
+
+def test_sdist_has_nothing_of_an_environment_in_its_folder(tmp_path: Path) -> None:
+    for name in ("pyproject.toml", "README.md", "LICENSE", "hatch_build.py"):
+        shutil.copy(ROOT / name, tmp_path)
+    for name in ("ros/lib/runtime/module.py", "ros/lib/LICENSE", "docs/page.md"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    ran = run("-m", "hatchling", "build", "--target", "sdist", folder=tmp_path)
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+    (archive,) = tmp_path.glob("dist/*.tar.gz")
+    with tarfile.open(archive) as tar:
+        packed = {name.partition("/")[2] for name in tar.getnames()}
+    assert "docs/page.md" in packed
+    assert not any(name.startswith("ros/") for name in packed)
 
 
 def test_variables_only_name_what_is_elsewhere() -> None:
