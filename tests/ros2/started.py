@@ -7,7 +7,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -81,7 +81,10 @@ class Robot:
 
     def goals(self, since: int = 0) -> list[Goal]:
         """Return the goal positions from instruction `since` on."""
-        found = wire.written(self.sent(since), self.bus, "goal_position")
+        return self._goals_in(self.sent(since))
+
+    def _goals_in(self, sent: Sequence[wire.Instruction]) -> list[Goal]:
+        found = wire.written(sent, self.bus, "goal_position")
         return [Goal(at, servo.joint, wire.angle(servo, raw)) for at, servo, raw in found]
 
     def moved(self, since: int) -> dict[str, set[float]]:
@@ -92,10 +95,14 @@ class Robot:
         return {joint: positions for joint, positions in found.items() if len(positions) > 1}
 
     def held(self, since: int) -> dict[str, list[float]]:
-        """Return the goals of each joint that got one, when all have stayed for some reads."""
+        """Return each joint's goals from its last one before `since` on, when all have stayed for some reads.
+
+        A goal that stays is sent again every ten seconds, so a joint may have been sent none since.
+        """
+        before = {one.joint: one for one in self._goals_in(self.sent()[:since])}
 
         def ended() -> list[Goal] | None:
-            goals = self.goals(since)
+            goals = [*before.values(), *self.goals(since)]
             last: dict[str, float] = {}
             changed_ns = 0
             for at, joint, position in goals:

@@ -192,11 +192,12 @@ def test_wrong_trajectories_are_rejected_and_nothing_moves(torso: Torso) -> None
 
 def test_tolerances_of_a_goal_are_those_of_that_goal_alone(torso: Torso) -> None:
     mark = torso.home()
-    tight = {"path_tolerance": [{"name": ELBOW, "position": 0.002}]}
+    # wider than its friction, which holds it a tick off, and narrower than its lag of a cycle
+    tight = {"path_tolerance": [{"name": ELBOW, "position": 0.05}]}
     end = torso.follow(goal(LEFT, (4.0, [*HOME[:2], -1.0]), **tight))
     assert (end["status"], end["error_code"]) == (ABORTED, PATH_TOLERANCE), end
     assert ELBOW in end["error_string"]
-    assert -0.9 < torso.robot.held(mark)[ELBOW][-1] <= HOME[2] + TICK
+    assert -0.9 < torso.robot.held(mark)[ELBOW][-1] < HOME[2] - TICK
     torso.home()
     tight = {"goal_tolerance": [{"name": ELBOW, "position": 1e-5}], "goal_time_tolerance": seconds(0.2)}
     end = torso.follow(goal(LEFT, (0.6, [*HOME[:2], 0.1]), **tight))
