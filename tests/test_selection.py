@@ -49,25 +49,27 @@ def test_all_and_named_paths_run_as_a_whole(tmp_path: Path, words: tuple[str, ..
     assert run(tmp_path, "-n", "0", *words).last.startswith("2 passed")
 
 
-def test_long_tests_are_first(tmp_path: Path) -> None:
+def test_files_with_time_limits_and_long_tests_are_first(tmp_path: Path) -> None:
     limited = SHORT.replace("def", "@__import__('pytest').mark.timeout(9)\ndef")
     files = {"test_a.py": SHORT, "test_b.py": LONG, "test_c.py": SHORT + limited.replace("short", "limited")}
     said = run(tmp_path, "-n", "0", "--all", "--collect-only", files=files).out.splitlines()
-    assert [line.partition("::")[0] for line in said[:4]] == ["test_b.py", *["test_c.py"] * 2, "test_a.py"]
+    assert [line.partition("::")[0] for line in said[:4]] == [*["test_c.py"] * 2, "test_b.py", "test_a.py"]
 
 
 def test_each_worker_begins_with_slow_files_and_ends_with_short_tests() -> None:
-    """The 12 tests are named by folder and number, and with L in a slow file."""
-    names = ["a/L1", "a/2", "b/L1", "b/L2", "b/3", "b/4", "c/L1", "c/2", "c/3", "c/4", "c/5", "c/6"]
+    """The 12 tests are named by folder and number, with L in a slow file, M in one with an own time limit."""
+    names = ["a/L1", "a/2", "b/L1", "b/L2", "b/3", "b/4", "c/M1", "c/2", "c/3", "c/4", "c/5", "c/6"]
+    marks = {"long": "L", "timeout": "M"}
     items = [
         SimpleNamespace(
-            path=Path(name), get_closest_marker=lambda mark, name=name: mark == "long" and "L" in name
+            path=Path(name),
+            get_closest_marker=lambda mark, name=name: marks[mark] in name and SimpleNamespace(args=(9,)),
         )
         for name in names
     ]
     dealt = [[item.path.name for item in selection.deal_tests(items, workers)] for workers in (1, 3)]
-    assert " ".join(dealt[0]) == "L1 L1 L2 L1 2 3 4 2 3 4 5 6"
-    assert " ".join(dealt[1]) == "L1 2 3 4 L1 L2 2 3 L1 4 5 6"
+    assert " ".join(dealt[0]) == "M1 L1 L1 L2 2 3 4 2 3 4 5 6"
+    assert " ".join(dealt[1]) == "M1 2 3 4 L1 2 3 4 L1 L2 5 6"
 
 
 def test_what_passed_is_left_out_of_the_next_run(tmp_path: Path) -> None:

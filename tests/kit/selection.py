@@ -139,13 +139,16 @@ def deal_tests(items: Sequence[pytest.Item], workers: int) -> list[pytest.Item]:
 
     `--dist worksteal` cuts the tests into one stretch a worker, and moves the end of a stretch to an idle
     worker. Where that has slow files, the others wait for the last one. Files of a folder share fixtures, so
-    they stay together.
+    they stay together; those with the longest time limits come first.
     """
-    slow = {item.path for item in items if any(map(item.get_closest_marker, ("long", "timeout")))}
-    folders: dict[Path, list[pytest.Item]] = {}
+    slow: dict[Path, float] = {}
     for item in items:
-        if item.path in slow:
-            folders.setdefault(item.path.parent, []).append(item)
+        limit = item.get_closest_marker("timeout")
+        if limit or item.get_closest_marker("long"):
+            slow[item.path] = max(slow.get(item.path, 0.0), limit.args[0] if limit else 0.0)
+    folders: dict[Path, list[pytest.Item]] = {}
+    for item in sorted((one for one in items if one.path in slow), key=lambda one: -slow[one.path]):
+        folders.setdefault(item.path.parent, []).append(item)
     stretches: list[list[pytest.Item]] = [[] for _ in range(workers)]
     # A file is a better measure of time than a test: some have hundreds of short ones.
     for tests in folders.values():
