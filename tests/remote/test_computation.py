@@ -5,11 +5,17 @@ import os
 import socket
 import time
 from contextlib import suppress
+from pathlib import Path
 
 import pytest
 from tests.kit.awaited import DEADLINE_S
 
+from dxlrun import RemoteRobot
 from dxlrun.remote.computation import computed
+from dxlrun.testing import plan_of
+from dxlrun.tooling.runs import VirtualLink
+
+ROBOTS = Path(__file__).parents[2] / "robots"
 
 
 def brood():
@@ -72,3 +78,9 @@ def test_a_connection_that_is_closed_meanwhile_is_closed():
 
     with theirs:
         assert asyncio.run(hang_up()) == b""
+
+
+def test_virtual_time_stands_still_while_a_copy_works():
+    """Else a motion begins later on a busy machine, or its copy is killed after 8 s of virtual time."""
+    with RemoteRobot("bioloid_torso", VirtualLink(plan_of(ROBOTS / "bioloid_torso.yaml"))) as robot:
+        assert robot.play(ROBOTS / "motions/three_parts.yaml").cycle == 1

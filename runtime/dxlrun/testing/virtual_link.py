@@ -208,7 +208,7 @@ class VirtualLink:
 
 
 class _VirtualTime(asyncio.SelectorEventLoop):
-    """Event loop in virtual time; `turn` replaces each wait."""
+    """Event loop in virtual time; `turn` replaces each wait that is not for another process."""
 
     def __init__(self, now_s: Callable[[], float], turn: Callable[[], None]) -> None:
         self._now_s = now_s
@@ -220,14 +220,20 @@ class _VirtualTime(asyncio.SelectorEventLoop):
 
 
 class _Turns(selectors.SelectSelector):
-    """Selector that never waits, and runs a turn instead."""
+    """Selector that waits only for other processes, and otherwise runs a turn."""
 
     def __init__(self, turn: Callable[[], None]) -> None:
         super().__init__()
         self._turn = turn
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
-        """Return the ready descriptors, after a turn if the caller would wait."""
-        if timeout is None or timeout > 0:
+        """Return the ready descriptors, after a turn if the caller would wait.
+
+        Virtual time stands still while another process prepares an answer, however long that takes.
+        """
+        waits = timeout is None or timeout > 0
+        if waits and len(self.get_map()) > 1:  # the pipe of the other process, and that of the event loop
+            return super().select()
+        if waits:
             self._turn()
         return super().select(0)
