@@ -122,7 +122,7 @@ def test_each_allowed_skip_is_one_of_the_tests() -> None:
         ("plugins/dxlrun_lab/stress.py", {"dxlrun_lab"}),
         ("plugins/dxlrun_view/src/dxlrun_view/web/page.js", {"dxlrun_view"}),
         ("robots/bioloid_torso.yaml", {"robots"}),
-        ("docs/index.md", {"docs"}),
+        ("docs/index.md", set()),
         ("bench/cycle_trace.py", {"bench"}),
         ("README.md", set()),
     ],
@@ -142,6 +142,19 @@ def test_changed_test_and_users_of_changed_kit_run() -> None:
     assert "tests/hand/test_terminal.py" in {*selection.affected_files(["tests/kit/hands.py"])}
 
 
+@pytest.mark.parametrize(
+    ("path", "files"),
+    [
+        ("docs/how-to/teleoperation.md", {"tests/teleop/test_terminal.py"}),
+        ("docs/examples/stand_up.py", {"tests/robots/test_stand_up.py"}),
+        ("docs/changes/+teleop.fixed.md", set()),
+        ("pyproject.toml", set()),
+    ],
+)
+def test_page_or_example_runs_the_long_tests_that_name_it(path: str, files: set[str]) -> None:
+    assert {*selection.affected_files([path])} == files
+
+
 def test_each_room_has_its_long_tests() -> None:
     files = [path for path, _ in selection.long_files()]
     assert {selection.folder_of(path) for path in files} <= set(selection.TESTED)
@@ -158,4 +171,4 @@ def test_each_folder_of_tests_is_about_rooms_that_exist() -> None:
     }
     rooms = {selection.room_of(selection.module_of(path)) for path in product} | {"dxlrun.features"}
     named = {room for rooms_of_folder in selection.TESTED.values() for room in rooms_of_folder}
-    assert named - rooms <= {"docs", "robots", "bench", "example"}
+    assert named - rooms <= {"robots", "bench", "example"}

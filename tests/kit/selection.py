@@ -5,7 +5,8 @@ Whatever is named on the command line runs as a whole. Of the whole suite everyt
 tests that a change can break:
 
     git diff --name-only main > changed.txt
-    pytest --changed=changed.txt    # and the long tests of rooms that changed, or import what changed
+    pytest --changed=changed.txt    # and the long tests of rooms that changed, or import what changed,
+                                    # and those that have the name of a page that changed
     pytest --all                    # everything
     pytest --all --passed=FILE      # and not the tests in FILE; those that pass are added to it
 
@@ -26,7 +27,7 @@ LIBRARIES = ("dxlrun", "dxlsim", "dxlwire")
 TESTED = {
     "analysis": ("dxlrun_analysis",),
     "bench": ("bench", "dxlwire"),
-    "cli": ("dxlrun.cli", "dxlrun.output", "dxlrun.tooling", "docs", "robots"),
+    "cli": ("dxlrun.cli", "dxlrun.output", "dxlrun.tooling", "robots"),
     "compile": ("dxlrun.compile", "dxlrun.plan"),
     "control": ("dxlrun.control", "dxlrun.contract", "dxlrun.plan"),
     "description": ("dxlrun.description",),
@@ -44,7 +45,7 @@ TESTED = {
     "log": ("dxlrun.log", "dxlrun.messages"),
     "mechanics": ("dxlrun.features.mechanics",),
     "phidget": ("phidget",),
-    "plugins": ("dxlrun_controllers", "dxlrun_space", "dxlrun.contract", "dxlrun.testing", "example", "docs"),
+    "plugins": ("dxlrun_controllers", "dxlrun_space", "dxlrun.contract", "dxlrun.testing", "example"),
     "remote": ("dxlrun.remote", "dxlrun.channels"),
     "robots": ("robots", "dxlrun_controllers", "dxlrun.control", "dxlrun.run", "dxlrun.features.mechanics"),
     "ros2": ("dxlrun_ros2",),
@@ -96,7 +97,7 @@ def affected_rooms(paths: Iterable[str]) -> set[str]:
     import grimp
 
     changed = [path for path in paths if path.startswith(("runtime/", "plugins/"))]
-    rooms = {str(Path(path).parts[0]) for path in paths if path.startswith(("docs/", "robots/"))}
+    rooms = {"robots" for path in paths if path.startswith("robots/")}
     rooms |= {"bench" for path in paths if path.startswith("bench/")}
     modules = {module_of(path) for path in changed}
     rooms |= {room_of(module) for module in modules if module}
@@ -113,9 +114,12 @@ def affected_rooms(paths: Iterable[str]) -> set[str]:
 def affected_files(paths: Collection[str]) -> Iterator[str]:
     """Yield the long test files that a change can break; `paths` are relative to the repository."""
     rooms = affected_rooms(paths)
-    kits = [module_of(f"x/{path}") for path in paths if path.startswith("tests/kit/")]
+    named = [module_of(f"x/{path}") for path in paths if path.startswith("tests/kit/")]
+    # a test has the names of the pages and examples that it reads
+    named += [Path(path).name for path in paths if path.startswith(("docs/", "README.md"))]
     for path, text in long_files():
-        if path in paths or not rooms.isdisjoint(TESTED[folder_of(path)]) or any(kit in text for kit in kits):
+        names = path in paths or any(one in text for one in named)
+        if names or not rooms.isdisjoint(TESTED[folder_of(path)]):
             yield path
 
 
