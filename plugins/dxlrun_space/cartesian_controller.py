@@ -501,8 +501,8 @@ class CartesianController(Controller[CartesianParameters]):
             if rate == 0.0 or passed_s >= path.duration_s:
                 break
             if self._goal is not None and not slope:
-                error = float(np.abs(self.context.states.position - self._at).max())
-                self._goal.feedback(passed_s / path.duration_s, error)
+                off = float(np.abs(self.context.states.position - self._at).max())
+                self._goal.feedback(passed_s / path.duration_s, off)
             yield
         goal = self._goal
         if goal is not None and not slope:
