@@ -1,5 +1,4 @@
-# ruff: noqa: E501 (a mistake and its sentence are read best side by side)
-"""Arguments and included files: values with their places. Mistakes: arguments.txt, included.txt."""
+"""Included files and groups: places of values, and merging; values: torso.txt, included.txt, shared.txt."""
 
 import functools
 import json
@@ -18,64 +17,7 @@ from dxlrun.description.document import KeyPath, confined, grow, literal, parse,
 from dxlrun.description.including import MOST_FILES, MOST_LEVELS, merged
 from dxlrun.description.joints.groups import NAMING, without_groups
 from dxlrun.description.motion import parse_motion
-from dxlrun.description.reading import Description
 from dxlrun.errors import Mark
-
-
-def figures(description: Description) -> tuple[str, float]:
-    """Return port and rate of the torso."""
-    return description.robot.buses["main"].port, description.robot.loop.rate
-
-
-@pytest.mark.parametrize(
-    ("given", "found"),
-    [
-        ({}, ("sim", 50.0)),
-        ({"port": "/dev/ttyUSB0", "rate": "62.5"}, ("/dev/ttyUSB0", 62.5)),
-        ({"port": "5"}, ("5", 50.0)),  # the default is a text, so it stays one
-        ({"port": "sim}\njoints: {evil: 1"}, ("sim}\njoints: {evil: 1", 50.0)),  # no structure is smuggled in
-    ],
-)
-def test_arguments_are_put_in_and_defaults_count_until_then(
-    given: dict[str, str], found: tuple[str, float]
-) -> None:
-    description = desk.robot(TORSO, given)
-    assert figures(description) == found
-    assert description.arguments == {"port": "sim", "rate": "50"} | given
-    assert set(description.robot.joints) == {"swing", "elbow"}
-
-
-@pytest.mark.parametrize(
-    ("right", "wrong", "found"),
-    [
-        ("rate: ${rate}\n", 'rate: "${rate}"\n', ("sim", 100.0)),  # inside { } YAML itself asks for quotes
-        ("rate: {default: 50, ", "rate: {", ("sim", 100.0)),
-        ('"loop rate, Hz"', '"used as ${rate}"', ("sim", 100.0)),  # help may explain how it is written
-        ('port: "${port}"', 'port: "$${a}/${port}"', ("${a}/sim", 100.0)),  # two dollars write one
-        ('port: "${port}"', 'port: "/dev/tty${rate}"', ("/dev/tty100", 100.0)),  # inside a longer text
-    ],
-)
-def test_use_of_an_argument(right: str, wrong: str, found: tuple[str, float]) -> None:
-    assert right in TORSO
-    assert figures(desk.robot(TORSO.replace(right, wrong), {"rate": "100"})) == found
-
-
-@pytest.mark.parametrize(
-    ("given", "said"),
-    [
-        ({"rate": "fast"}, ["robot.yaml:8:9: loop.rate: 'fast' is not a rate (argument rate:=fast); write a rate such as 50, 50 Hz or 1 kHz"]),
-        ({"prot": "sim", "x": "1"}, ["command line: argument prot:=sim is not declared in the robot file; did you mean port?", "command line: argument x:=1 is not declared in the robot file; known arguments: port, rate"]),
-    ],
-)  # fmt: skip
-def test_wrong_argument_is_reported_where_it_is(given: dict[str, str], said: list[str]) -> None:
-    assert desk.refusals(TORSO, given) == said
-
-
-def test_without_a_block_there_are_no_arguments() -> None:
-    first, second, *_ = desk.refusals("name: x\nloop: {rate: '${rate}'}\n", {"rate": "1"})
-    assert first.startswith("command line: argument rate:=1 is not declared in the robot file; remove it")
-    assert "has no" in second
-
 
 HEAD = read_head(CASES / "included.txt").partition("---- head.yaml\n")[2]
 
@@ -87,28 +29,9 @@ def including() -> str:
     return f"include: [fragments/head.yaml]\n{TORSO}"
 
 
-def test_a_fragment_adds_its_keys_before_those_of_the_file(including: str) -> None:
-    robot = desk.robot(including).robot
-    assert list(robot.joints) == ["yaw", "swing", "elbow"]
-    assert list(robot.controllers) == ["head", "broadcaster", "arm"]
-    assert robot.joints["yaw"].limits.velocity == 1.0
-
-
-def test_arguments_of_fragments_are_arguments_of_the_robot(including: str) -> None:
-    description = desk.robot(including, {"speed": "2 rad/s"})
-    assert description.robot.joints["yaw"].limits.velocity == 2.0
-    assert description.arguments == {"speed": "2 rad/s", "port": "sim", "rate": "50"}
-    assert description.robot.buses["main"].port == "sim"  # the including file's default counts
-
-
-def test_the_including_file_wins_at_every_depth_but_replaces_lists(including: str) -> None:
+def test_values_of_both_files_keep_their_places_and_arguments(including: str) -> None:
     text = including.replace("joints:\n", "joints:\n  yaw: {id: 7, limits: {position: [-1 rad, 1 rad]}}\n", 1)
-    text = text.replace("controllers:\n", "controllers:\n  head: {joints: [swing]}\n")
-    description = desk.robot(text)
-    joint, marks = description.robot.joints["yaw"], description.marks
-    assert (joint.id, joint.bus, joint.model) == (7, "main", "AX-12A")
-    assert (joint.limits.position, joint.limits.velocity) == ((-1.0, 1.0), 1.0)
-    assert description.robot.controllers["head"].parameters == {"joints": ["swing"]}
+    marks = desk.robot(text.replace("controllers:\n", "controllers:\n  head: {joints: [swing]}\n")).marks
     main, fragment = str(Path.cwd() / "robot.yaml"), str(Path.cwd() / "fragments/head.yaml")
     assert marks.value("joints", "yaw", "id") == Mark(main, 12, 13)
     assert marks.value("joints", "yaw", "model") == Mark(fragment, 5, 35)
@@ -117,37 +40,6 @@ def test_the_including_file_wins_at_every_depth_but_replaces_lists(including: st
     assert marks.value("controllers", "head", "joints", 0) == Mark(
         main, 16, 19
     )  # that of the fragment is gone
-
-
-def test_what_the_fragment_got_wrong_and_the_file_replaced_is_no_mistake_of_form(including: str) -> None:
-    desk.write(HEAD.replace("id: 21", "id: x"), "fragments/head.yaml")
-    robot = desk.robot(including.replace("joints:\n", "joints:\n  yaw: {id: 7}\n", 1)).robot
-    assert robot.joints["yaw"].id == 7
-
-
-def test_fragments_include_relative_to_themselves_and_later_ones_win() -> None:
-    (Path.cwd() / "a").mkdir()
-    desk.write("loop: {rate: 10}\ninclude: [b.yaml]\n", "a/a.yaml")
-    desk.write("loop: {rate: 20, scheduler: {priority: 5}}\n", "a/b.yaml")
-    desk.write("recording: {directory: c}\n", "c.yaml")
-    text = (
-        TORSO.split("loop:", maxsplit=1)[0]
-        + "include: [a/a.yaml, c.yaml]\njoints:"
-        + TORSO.split("joints:", 1)[1]
-    )
-    text = text.replace("recording: {directory: elsewhere}\n", "")
-    description = desk.robot(text.replace("rate: 25", "rate: 5"))
-    assert (description.robot.loop.rate, description.robot.loop.scheduler.priority) == (10, 5)
-    assert description.robot.recording.directory == "c"
-    assert [Path(name).name for name in description.included] == ["b.yaml", "a.yaml", "c.yaml"]
-
-
-def test_a_fragment_that_two_files_include_counts_below_both() -> None:
-    desk.write("recording: {directory: shared}\n", "shared.yaml")
-    desk.write("include: [shared.yaml]\nrecording: {directory: left}\n", "left.yaml")
-    desk.write("include: [shared.yaml]\n", "right.yaml")
-    text = TORSO.replace("recording: {directory: elsewhere}", "include: [left.yaml, right.yaml]")
-    assert desk.robot(text).robot.recording.directory == "left"
 
 
 def test_depth_number_and_size_are_bounded() -> None:
@@ -229,35 +121,9 @@ def test_merging_is_deep_and_each_value_keeps_the_mark_of_its_file(documents: li
 ROBOT = robot_text("shared")
 
 
-def test_joints_have_what_they_share() -> None:
-    robot = desk.robot(ROBOT).robot
-    assert list(robot.joints) == ["knee", "shoulder", "elbow"]  # the order of `joints`, which is that of rows
-    assert [joint.bus for joint in robot.joints.values()] == ["right", "left", "left"]
-    assert [joint.direction for joint in robot.joints.values()] == [-1, 1, -1]
-    assert robot.joints["shoulder"].limits.position == (-1.0, 1.0)
-    assert {joint.limits.velocity for joint in robot.joints.values()} == {2.0}
-    assert [joint.registers for joint in robot.joints.values()] == [
-        {"position_p_gain": 800, "position_d_gain": 0},
-        {"position_p_gain": 700, "position_d_gain": 5},
-        {"position_p_gain": 700, "position_d_gain": 0},
-    ]
-
-
-def test_a_group_stands_for_its_joints_wherever_they_are_named() -> None:
-    description = desk.robot(ROBOT)
-    robot = description.robot
-    assert description.groups == {
-        "left": ("shoulder", "elbow"),
-        "right": ("knee",),
-        "body": ("shoulder", "elbow", "knee"),
-    }
-    assert robot.controllers["all_joints"].parameters == {"joints": ["knee", "shoulder", "elbow"]}
-    home = robot.poses["home"]
-    assert home == {"shoulder": 0.0, "knee": 0.0, "elbow": 1.0}
-    groups = {name: group.joints for name, group in robot.policies.groups.items()}
-    assert groups == {"left": ("shoulder", "elbow"), "other": ("knee",)}
+def test_a_group_stands_for_its_joints_in_parameters_of_any_depth() -> None:
     steps = [{"pose": {"left": 0, "knee": 1}, "torque": {"body": 2}}]
-    assert without_groups({"steps": steps, "into": ["left"]}, description.groups) == {
+    assert without_groups({"steps": steps, "into": ["left"]}, desk.robot(ROBOT).groups) == {
         "steps": [
             {"pose": {"shoulder": 0, "elbow": 0, "knee": 1}, "torque": {"shoulder": 2, "elbow": 2, "knee": 2}}
         ],
@@ -291,33 +157,3 @@ def test_motions_name_groups() -> None:
     assert list(motion.motion.motions[0].points[0].joints) == ["shoulder", "elbow", "knee"]
     where = motion.marks.key("motions", 0, "points", 0, "joints", "elbow")
     assert where == Mark("m.yaml", 5, 26)
-
-
-def test_a_joint_of_a_transmission_gets_no_keys_of_a_servo() -> None:
-    wrist = """\
-  pitch: {}
-  roll: {}
-transmissions:
-  wrist:
-    type: differential
-    joints: [hand]
-    servos:
-      a: {bus: left, id: 8, model: XL430-W250, reference: 180 deg, direction: 1}
-      b: {bus: left, id: 9, model: XL430-W250, reference: 180 deg, direction: -1}
-controllers:"""
-    text = ROBOT.replace("controllers:", wrist).replace(
-        "groups:\n", "groups:\n  hand: {bus: left, joints: [pitch, roll]}\n", 1
-    )
-    robot = desk.robot(text).robot
-    assert robot.joints["pitch"].limits.velocity == 2.0
-    assert not hasattr(robot.joints["pitch"], "bus")
-
-
-def test_fragments_share_groups() -> None:
-    desk.write(ROBOT, "pair.yaml")
-    robot = desk.robot(
-        "include: [pair.yaml]\ngroups: {left: {joints: [elbow]}}\njoint_defaults: {model: XL430-W250}\njoints: {shoulder: {bus: right}}\n"
-    ).robot
-    assert robot.groups["left"].joints == ("elbow",)
-    assert {joint.model for joint in robot.joints.values()} == {"XL430-W250"}
-    assert robot.controllers["all_joints"].parameters == {"joints": ["knee", "elbow"]}

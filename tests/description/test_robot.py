@@ -1,7 +1,6 @@
 # ruff: noqa: E501 (a mistake and its sentence are read best side by side)
-"""Robot files in SI units, what is left out, values that replace others, and problems in our words."""
+"""Robot files: places, values that replace others, and problems in our words; values: torso.txt."""
 
-import math
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -14,41 +13,6 @@ from dxlrun.description.document import KeyPath, Marks, grow, literal, parse
 from dxlrun.description.form_problems import problems_of
 from dxlrun.description.reading import Replacement, read_robot
 from dxlrun.errors import Mark, near, suggestion
-
-
-def test_a_robot_file_becomes_si_units() -> None:
-    robot = desk.robot(TORSO).robot
-    assert robot.name == "torso"
-    bus = robot.buses["main"]
-    assert (bus.protocol, bus.baud_rate) == (1.0, 1_000_000)
-    assert (bus.adapter.latency, bus.return_delay_time) == (10**6, 250_000)
-    swing = robot.joints["swing"]
-    assert (swing.bus, swing.id, swing.model, swing.direction) == ("main", 1, "AX-12A", -1)
-    assert swing.reference == pytest.approx(math.pi / 3)
-    assert swing.limits.position == pytest.approx((-math.pi, math.pi / 3))
-    scheduler = robot.loop.scheduler
-    assert (scheduler.policy, scheduler.priority, scheduler.lock_memory) == ("round_robin", 31, True)
-    assert robot.policies.exit_timeout == 3_000_000_000
-    assert robot.recording.directory == "elsewhere"
-    arm = robot.controllers["arm"]
-    assert (arm.type, arm.active, arm.rate) == ("joint_group_position_controller", False, None)
-    assert arm.parameters == {"joints": ["swing", "elbow"]}
-    assert robot.controllers["broadcaster"].rate == 25.0
-
-
-def test_what_is_left_out_has_its_default() -> None:
-    robot = desk.robot(
-        "name: x\nbuses: {m: {port: sim, protocol: 1, baud_rate: 57600}}\nloop: {rate: 50}\n"
-        "joints: {j: {bus: m, id: 1, model: A, reference: 0 deg, direction: +1}}\n"
-    ).robot
-    assert (robot.buses["m"].adapter.latency, robot.buses["m"].return_delay_time) == (16_000_000, 500_000)
-    scheduler = robot.loop.scheduler
-    assert (scheduler.policy, scheduler.priority, scheduler.lock_memory) == ("other", 31, False)
-    assert robot.loop.overrun == "skip"
-    assert (robot.joints["j"].limits.position, robot.joints["j"].limits.velocity) == (None, None)
-    assert robot.controllers == {}
-    assert (robot.policies.on_exit, robot.policies.exit_timeout) == ("limp", 2_000_000_000)
-    assert robot.recording.directory == "logs"
 
 
 def test_the_text_and_the_places_are_kept() -> None:

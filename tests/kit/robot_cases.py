@@ -10,13 +10,14 @@ pair` is the robot file of `pair.txt`, to which lines may be added. Other files 
       = joints.left_arm_joint.lower: -210 deg
       = servos.left_arm_joint: {lower_tick: 0, upper_tick: 1023}
 
-At the margin is a line for each change (`\\n` is a new line; `+ ` puts one at the end of the robot file).
-Below is one for each problem, at the place of § or at its own (`9:5: ...`, `pair.urdf:2:3: ...`), and one for
-each fact. A case without problems is right; where nothing is below it, an empty line ends it. `HELP` is the
-address of the page "It does not work".
+At the margin is a line for each change (`\\n` is a new line; `+ ` puts one at the end of the robot file), or
+for an argument (`rate:=100`). Below is one for each problem, at the place of § or at its own (`9:5: ...`,
+`pair.urdf:2:3: ...`), and one for each fact. A case without problems is right; where nothing is below it, an
+empty line ends it. `HELP` is the address of the page "It does not work".
 
 The path of a fact starts at one of ROOTS. An entry of a list is found by its name or number; the name of a
-field gives the field of each entry. A number is compared in all digits that are written, and may have a unit.
+field gives the field of each entry; a list may have the keys of a mapping. A number is compared in all digits
+that are written, and may have a unit.
 """
 
 import json
@@ -25,6 +26,7 @@ import re
 from collections.abc import Callable, Mapping
 from enum import Enum
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 import pytest
@@ -34,10 +36,12 @@ from tests.kit.robots import whole_text
 
 from dxlrun.compile.robot_compiler import CompiledRobot, compile_files
 from dxlrun.compile.simulation import simulation_of
+from dxlrun.description.reading import read_robot
 from dxlrun.errors import InputError, Problem
 from dxlwire.exceptions import HELP
 
 ROOTS: Mapping[str, Callable[[CompiledRobot], object]] = {
+    "robot": lambda robot: read_robot(Path("robot.yaml"), robot.plan.arguments).robot,
     "plan": lambda robot: robot.plan,
     "loop": lambda robot: robot.plan.loop,
     "joints": lambda robot: robot.plan.loop.joints,
@@ -56,11 +60,13 @@ WORDS: Mapping[str, object] = {"true": True, "false": False, "none": None}
 
 def check_case(case: TextCase) -> None:
     """Compare the problems and the plan of a changed robot file with what the case has."""
-    text, place = whole_text(case.head), case.place
+    text, place, arguments = whole_text(case.head), case.place, dict[str, str]()
     below = [line.text.strip() for line in case.lines if line.is_indented]
     for change in filter(None, [case.name, *(line.text for line in case.lines if not line.is_indented)]):
         right, _, wrong = change.replace("\\n", "\n").partition(" => ")
-        if right.startswith("+ "):
+        if given := re.match(r"(\w+):=", right):
+            arguments[given[1]] = right[given.end() :]
+        elif right.startswith("+ "):
             robot, mark, rest = text.partition("---- ")
             text = f"{robot}{right[2:]}\n{mark}{rest}"
         else:
@@ -70,7 +76,7 @@ def check_case(case: TextCase) -> None:
     file, _, before = before[2].partition("\n") if before[1] else ("robot.yaml", "", before[2])
     column = len(before) - before.rfind("\n")
     pointed = f"{file}:{before.count(chr(10)) + 1}:{column}: "
-    compiled, found = compile_cases(text.replace("§", ""))
+    compiled, found = compile_cases(text.replace("§", ""), arguments)
     said = [str(one).replace(f"{Path.cwd()}/", "").replace(HELP, "HELP") for one in found]
     said = [one.removeprefix(pointed).removeprefix("robot.yaml:") for one in said]
     assert said == [one for one in below if not one.startswith("= ")], place
@@ -81,16 +87,19 @@ def check_case(case: TextCase) -> None:
         assert is_same(value, yaml.load(expected, yaml.BaseLoader)), f"{place}: {path} is {value!r}"  # noqa: S506  texts of ours
 
 
-def compile_cases(text: str) -> tuple[CompiledRobot | None, tuple[Problem, ...]]:
+def compile_cases(
+    text: str, arguments: Mapping[str, str] = MappingProxyType({})
+) -> tuple[CompiledRobot | None, tuple[Problem, ...]]:
     """Write the files of a text into the working directory; return the compiled robot and its problems."""
     robot, *others = text.split("---- ")
     Path("robot.yaml").write_text(robot, "utf-8")
     for other in others:
         name, _, content = other.partition("\n")
+        Path(name).parent.mkdir(exist_ok=True)
         Path(name).write_text(content, "utf-8")
     motions = sorted(Path.cwd().glob("motion*.yaml"))
     try:
-        compiled = compile_files(Path.cwd() / "robot.yaml", {}, motions)
+        compiled = compile_files(Path.cwd() / "robot.yaml", arguments, motions)
     except InputError as error:
         return None, error.problems
     return compiled, compiled.warnings
@@ -134,7 +143,7 @@ def is_same(value: object, expected: object) -> bool:
             return all(is_same(getattr(value, key), one) for key, one in expected.items())
         return value.keys() == expected.keys() and all(is_same(value[key], expected[key]) for key in value)
     if isinstance(expected, list):
-        rows = list(value) if isinstance(value, list | tuple) else []
+        rows = list(value) if isinstance(value, list | tuple | Mapping) else []
         return len(rows) == len(expected) and all(map(is_same, rows, expected))
     return _is_same_word(value, str(expected))
 

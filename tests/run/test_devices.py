@@ -1,4 +1,4 @@
-"""Boards and devices on the buses of a robot: the log is the ledger, what they measure, what is refused."""
+"""Boards and devices on the buses of a robot: the log is the ledger, and what they measure."""
 
 import math
 from typing import Any
@@ -6,8 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 from fastcrc import crc16
+from tests.kit.cases import read_head
 from tests.kit.judges import log_has_every_byte, uncaused, unnoticed
 from tests.kit.line_faults import other_host
+from tests.kit.robots import CASES
 
 from dxlrun import Controller, Interfaces, ParametersModel
 from dxlrun.channels.cycle import Torque
@@ -16,10 +18,8 @@ from dxlrun.cli import main
 from dxlrun.cli.sim import sim
 from dxlrun.compile import robot_compiler
 from dxlrun.control.controllers.plugin_loading import Offer, PlugIns, load_plugins
-from dxlrun.errors import InputError
 from dxlrun.run import virtual_run
 from dxlrun.run.simulation_front import SimulationResult
-from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.testing import read_log, simulated_robot
 from dxlrun_analysis.replay import log_replay, replay_log
 from dxlrun_analysis.report import analyze_log
@@ -95,16 +95,10 @@ def dozen(tmp_path, monkeypatch):
     return build
 
 
-def inject(run: VirtualRobot, *texts: str) -> None:
-    """Hang faults on the line; their times count from the start of the run."""
-    begin_ns = 0
-    script = FaultScript([parse_fault(text) for text in texts], 0)
-    script.attach(run.buses, start_ns=begin_ns, now_ns=begin_ns)
-
-
 def test_the_log_is_the_ledger_and_a_lost_device_costs_the_servos_nothing(dozen, tmp_path):
     run = dozen(1.3)
-    inject(run, "silence servo=101 at=300ms for=150ms", "silence servo=43 at=320ms")
+    faults = "silence servo=101 at=300ms for=150ms", "silence servo=43 at=320ms"
+    FaultScript([*map(parse_fault, faults)]).attach(run.buses)
     run.run()
     log = read_log(tmp_path / "run.mcap")
     log_has_every_byte(log, run.ledger.entries)
@@ -164,46 +158,12 @@ def test_what_devices_measure_and_are_told_is_what_the_bus_has(dozen, tmp_path):
     assert last["device_command"].tolist() == [1.0, 77.0]
 
 
-BOARD = """\
-kind = "device"
-model = "my-board"
-model_number = 60_123
-protocol = 2.0
-capabilities = ["sync_read"]
-cyclic = ["force"]
-
-[items]
-lamp = {address = 20, size = 1, access = "RW", maximum = 1, initial = 0, safe = 0}
-force = {address = 30, size = 2, encoding = "twos_complement", tick = "-10 mN", offset = "1 N"}
-start = {address = 32, size = 1, bit = 2, state = "button.start"}
-stop = {address = 32, size = 1, bit = 5, state = "button.stop"}
-"""
-ROBOT = """\
-name: with_boards
-buses:
-  main: {port: sim, protocol: 2.0, baud_rate: 1_000_000, adapter: {latency: 0 ms}, return_delay_time: 0 us}
-loop: {rate: 100}
-joints:
-  neck: {bus: main, id: 1, model: XL430-W250, reference: 180 deg, direction: 1}
-devices:
-  imu: {bus: main, id: 241, model: bitbots-imu}
-  core: {bus: main, id: 42, model: bitbots-core}
-  cr: {bus: main, id: 200, model: OpenCR, simulation: {values: {button.user: 1}}}
-  mine:
-    bus: main
-    id: 7
-    model: boards/mine.toml
-    states: {toe: force, go: start, halt: stop}
-    simulation: {values: {toe: -3.5, halt: 1}}
-controllers:
-  joint_state_broadcaster: {type: joint_state_broadcaster}
-"""
+ROBOT, _, BOARD = read_head(CASES / "boards.txt").partition("---- mine.toml\n")
 
 
 @pytest.fixture
 def robot(tmp_path):
-    (tmp_path / "boards").mkdir()
-    (tmp_path / "boards" / "mine.toml").write_text(BOARD)
+    (tmp_path / "mine.toml").write_text(BOARD)
     path = tmp_path / "robot.yaml"
     path.write_text(ROBOT)
     return path
@@ -222,7 +182,7 @@ def test_boards_are_read_in_si_units(robot):
     assert values["cr/linear_acceleration.z"] == pytest.approx(9.80665)
     assert [values[f"cr/button.{each}"] for each in ("mode", "start", "user", "reset")] == [0, 0, 1, 0]
     assert (values["mine/toe"], values["mine/go"], values["mine/halt"]) == (pytest.approx(-3.5), 0, 1)
-    assert run.plan.included["boards/mine.toml"] == BOARD
+    assert run.plan.included["mine.toml"] == BOARD
     assert run.events.named == ()
 
 
@@ -319,36 +279,3 @@ def test_dxlrun_sim_has_the_bodies_that_its_devices_are_on(tmp_path, monkeypatch
     )
     assert main(["sim", str(tmp_path / "nodding.yaml")]) == 0
     assert served[0].sensed is not None
-
-
-TWICE = "bit 2 of address 32 is defined twice; correct the file"
-NO_URDF = "imu is on link head, but the robot file has no URDF"
-
-
-@pytest.mark.parametrize(
-    ("text", "before", "after", "sentence"),
-    [
-        (ROBOT, "boards/mine", "boards/yours", "boards/yours.toml of mine cannot be read: No such file"),
-        (ROBOT, "toe: -3.5", "heel: -3.5", "mine has no state heel"),
-        (ROBOT, "halt: 1}}", "halt: 1}, noise: {toe: -1}}", "the noise of toe is negative; write a standard"),
-        (ROBOT, "toe: -3.5", "toe: heavy", "'heavy' is not a number; write a number in SI units"),
-        (
-            ROBOT,
-            "protocol: 2.0, baud",
-            "protocol: 1.0, baud",
-            "my-board of mine speaks Protocol 2.0, bus main",
-        ),
-        (ROBOT, "boards/mine", "boards/twice", TWICE),
-        (ON_A_LINK, "link: head", "link: haed", "link haed of imu is not in the URDF; did you mean head"),
-        (ON_A_LINK, "model: {urdf: nodding.urdf}\n", "", NO_URDF),
-    ],
-)
-def test_a_mistake_of_a_board_is_named(robot, text, before, after, sentence):
-    assert before in text
-    (robot.parent / "nodding.urdf").write_text(URDF)
-    (robot.parent / "boards" / "twice.toml").write_text(BOARD.replace("bit = 5", "bit = 2"))
-    robot.write_text(text.replace(before, after, 1))
-    with pytest.raises(InputError) as error:
-        simulated_robot(robot)
-    assert sentence in str(error.value)
-    assert f"{robot.name}:" in str(error.value)

@@ -62,15 +62,24 @@ buses: {main: {port: sim, protocol: 2.0, baud_rate: 1_000_000, return_delay_time
 joints:
   left: {bus: main, id: 1, model: XM430-W350, reference: 0 deg, direction: 1, continuous: true}
   lift: {bus: main, id: 2, model: XM430-W350, reference: 180 deg, direction: 1}
+devices: {board: {bus: main, id: 42, model: board.toml, states: [id], commands: [lamp]}}
 controllers:
   drive: {type: joint_group_velocity_controller, joints: [left]}
 policies: {on_fault: hold}
+"""
+BOARD = """\
+kind = "device"
+model = "my-board"
+protocol = 2.0
+[items]
+lamp = {address = 20, size = 1, access = "RW", maximum = 9, initial = 0, safe = 3}
 """
 
 
 @pytest.fixture
 def safe_stop(tmp_path, monkeypatch):
     """A robot whose loop dies in the middle of a run, and what makes its simulated servos safe."""
+    (tmp_path / "board.toml").write_text(BOARD)
     (tmp_path / "wheels.yaml").write_text(WHEELS)
     robot = simulated_robot(tmp_path / "wheels.yaml", duration_s=0.4)
     hardware = robot.robot.hardware
@@ -101,7 +110,7 @@ def test_a_guardian_that_leaves_torque_on_stops_what_is_led_by_a_velocity(safe_s
     assert wheel.registers["goal_velocity"] > 0
     said = safe_stop.apply_final_state((), "it died", texts.loop_failed)
     assert said == ["it died", TORQUE_STAYS, "left (ID 1 on bus main) was stopped: its goal is 0"]
-    assert wheel.registers["goal_velocity"] == 0
+    assert (wheel.registers["goal_velocity"], robot.buses[0].device(42).registers["lamp"]) == (0, 3)
     assert [servo.torque_on for servo in robot.buses[0].servos] == [True, True]
 
 
@@ -135,6 +144,7 @@ def test_a_safe_stop_names_the_servos_that_did_not_confirm_torque_off(safe_stop,
         assert result == "torque off was confirmed by all 2 servos"
         assert event.severity == Severity.WARNING
     assert [servo.torque_on for servo in robot.buses[0].servos] == [False, silent]
+    assert robot.buses[0].device(42).registers["lamp"] == 3, "the safe value of the board"
 
 
 def test_what_the_loop_had_on_its_desk_when_it_died_comes_into_the_log(tmp_path):
