@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import runpy
 import shlex
@@ -57,11 +58,16 @@ class Torso(VirtualLink):
     def close(self) -> None:
         """Leave the run to the other clients."""
 
-    def goal(self, joint: str) -> float:
-        """Return where a joint is sent a second later, rad."""
+    def steered(self) -> list[str]:
+        """Return the texts of the events that name a command."""
+        return [one["text"] for one in self.robot.events()["events"] if one["name"] == "steered"]
+
+    def goals(self) -> list[str]:
+        """Return where the head is sent a second later: yaw and pitch, deg."""
         for _ in range(50):
             self.run_cycle()
-        return float(self.robot.states().joint(joint)["goal_position"])
+        joints = map(self.robot.states().joint, ("head_yaw_joint", "head_pitch_joint"))
+        return [f"{math.degrees(joint['goal_position']):.0f}" for joint in joints]
 
 
 @pytest.fixture
@@ -87,16 +93,10 @@ def test_the_list_has_every_controller_and_what_it_takes(dxlrun, torso: Torso) -
 
 @pytest.mark.parametrize("case", cases("steered.txt"))
 def test_what_is_typed_is_answered(dxlrun, torso: Torso, case: Case) -> None:
-    play(case, dxlrun, commands.Stage())
-
-
-def test_send_moves_the_joints_that_are_named_with_units_by_one_request(dxlrun, torso: Torso) -> None:
-    said = dxlrun("send", "head", "posvel", "positions=[20 deg, -30 deg]", "velocities=[1 rad/s, 30 rpm]")
-    assert said == (0, "bioloid_torso: head accepted posvel\n", "")
-    asked = ["POST /controllers/head/commands/posvel?units=true", "GET /topics"]
-    assert torso.asked == asked
-    goals = [torso.goal(joint) for joint in ("head_yaw_joint", "head_pitch_joint")]
-    assert goals == pytest.approx([-0.5236, 0.3491], abs=0.003)
+    stage = commands.Stage()
+    stage.given = {"twin": torso.names.append}
+    stage.asked = {"asked": lambda: torso.asked, "steered": torso.steered, "goals": torso.goals}
+    play(case, dxlrun, stage)
 
 
 def test_python_follows_and_cancels_a_goal(torso: Torso) -> None:
@@ -116,48 +116,11 @@ def test_python_follows_and_cancels_a_goal(torso: Torso) -> None:
     assert torso.robot.goals()[-1].number == goal.number
 
 
-def test_a_motion_is_played_into_a_robot_that_runs(dxlrun, torso: Torso, tmp_path: Path) -> None:
-    file = tmp_path / "nod.yaml"
-    file.write_text(
-        "name: nod\nmotions:\n"
-        "  - controller: head\n    points:\n"
-        "      - time: 100 ms\n        joints:\n"
-        "          head_pitch_joint: {position: 0 deg, velocity: 1 rad/s}\n"
-        "          head_yaw_joint: {position: 10 deg, velocity: 1 rad/s}\n"
-    )
-    said = dxlrun("play", file, "--json")
-    result = result_of(said.out)
-    assert (said.code, result["status"], result["controller"]) == (0, "reached", "head")
-    assert torso.goal("head_yaw_joint") == pytest.approx(0.1745, abs=0.003)
-    torso.robot.switch(deactivate=["head"])
-    said = dxlrun("play", file)
-    assert (said.code, said.errors) == (
-        2,
-        [f"{file}:3:17: controller head is not active; activate it by `dxlrun switch --activate head`"],
-    )
-
-
 def test_a_refusal_has_its_code_and_its_fields_for_programs(dxlrun, torso: Torso) -> None:
     said = dxlrun("switch", "--activate", "head", "--json")
     (error,) = read_answer(said.out).errors
     assert (said.code, error.what, torso.asked) == (1, "head is active already", ["POST /switch"])
     assert (error.code, error.fields) == ("active_already", {"controller": ["head"]})
-
-
-def test_of_several_robots_one_must_be_chosen(dxlrun, torso: Torso) -> None:
-    torso.names.append("twin")
-    said = dxlrun("pause")
-    assert (said.code, said.err) == (
-        2, "dxlrun: several robots run; choose one: --robot bioloid_torso, --robot twin\n",
-    )  # fmt: skip
-    assert dxlrun("rate", "40", "--robot", "twin").out == "twin runs at 40 Hz\n"
-    assert dxlrun("list").out.count(": 40 Hz, ") == 2
-
-
-def test_the_log_names_the_command_of_the_terminal(dxlrun, torso: Torso) -> None:
-    assert dxlrun("rate", "60").code == 0
-    texts = [one["text"] for one in torso.robot.events()["events"] if one["name"] == "steered"]
-    assert texts == ["rate 60 Hz from dxlrun rate"]
 
 
 def test_stop_waits_for_the_end_by_default(dxlrun, torso: Torso, monkeypatch: pytest.MonkeyPatch) -> None:

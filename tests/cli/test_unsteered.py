@@ -13,6 +13,8 @@ from tests.kit.awaited import DEADLINE_S
 from tests.kit.commands import Dxlrun
 
 from dxlrun.channels.heartbeat import GatewayAvailability, Phase
+from dxlrun.remote.sockets import create_listener
+from dxlrun.run.unsteered import unsteered_runs
 
 Begin = Callable[..., subprocess.Popen[str]]
 LOOP = """\
@@ -127,6 +129,20 @@ def test_several_runs_are_not_ended_without_a_name(dxlrun: Dxlrun, begin: Begin)
     said = dxlrun("stop")
     assert (said.code, "--robot left_arm, --robot right_arm" in said.err) == (2, True)
     assert [loop.poll() for loop in loops] == [None, None]
+
+
+def test_runs_of_one_name_have_their_process_in_it(dxlrun: Dxlrun, begin: Begin) -> None:
+    """Unless one of them is the only one that is left, and none listens under the name."""
+    loops = begin("twin_arm"), begin("twin_arm")
+    names = [f"twin_arm-{loop.pid}" for loop in loops]
+    said = dxlrun("stop", "--robot", "twin_arm")
+    assert (said.code, all(f"--robot {name}" in said.err for name in names)) == (2, True)
+    assert [loop.poll() for loop in loops] == [None, None]
+    assert dxlrun("stop", "--robot", names[0]).out.startswith(names[0])
+    assert loops[0].wait(DEADLINE_S) == 0
+    with create_listener("twin_arm")[0]:
+        assert [run.name for run in unsteered_runs()] == names[1:]
+    assert dxlrun("stop", "--robot", names[1]).out.startswith("twin_arm has ended")
 
 
 def test_process_that_does_not_end_is_named_with_what_to_do(

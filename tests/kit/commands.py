@@ -36,7 +36,7 @@ from dxlrun.cli.app import build
 
 ROOT = Path(__file__).parents[2]
 TEXTS = ROOT / "tests" / "cli"
-NEEDED = {"identify": "identify"}
+NEEDED = {"identify": "identify", "analyze logs/newest.mcap --report": "report"}
 """Beginnings of commands that need an extra."""
 
 

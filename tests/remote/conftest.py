@@ -7,6 +7,7 @@ import time
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import SimpleNamespace
 from typing import Annotated, ClassVar
 
@@ -26,9 +27,6 @@ from dxlrun.channels.mailbox import Mailbox
 from dxlrun.channels.topic_messages import LONGEST_RECORD, MessageRing
 from dxlrun.compile import robot_compiler
 from dxlrun.control.controllers.plugin_loading import Offer, PlugIns, load_plugins
-from dxlrun.plan.loop_plan import ControllerPlan, JointPlan, LoopPlan, SchedulerPlan
-from dxlrun.plan.recording_plan import RecordingPlan
-from dxlrun.plan.robot_plan import Plan
 from dxlrun.remote.gateway import GatewayApp
 from dxlrun.remote.job import Descriptors
 from dxlrun.remote.link import Link
@@ -178,63 +176,21 @@ def plugins():
     return PlugIns({**load_plugins().controllers, **own}, {}, drivers=load_plugins().drivers)
 
 
-@pytest.fixture(scope="module")
-def plan_in(tmp_path_factory):
+@cache
+def plan_in(name="controllers.txt"):
     """Return the plan of a text's robot, compiled once."""
-
-    @cache
-    def compiled(name):
-        file = tmp_path_factory.mktemp("requests") / "robot.yaml"
+    with TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(robot_compiler, "load_plugins", lambda **_: plugins())
+        file = Path(folder) / "robot.yaml"
         file.write_text(read_head(TEXTS / name))
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(robot_compiler, "load_plugins", lambda **_: plugins())
-            return plan_of(file)
-
-    return compiled
-
-
-def controller(name, joint, active=True):
-    return ControllerPlan(
-        name=name,
-        type="arm",
-        distribution="tests 1",
-        parameters=json.dumps({"joints": [joint]}),
-        joints=(joint,),
-        command=("position",),
-        publishes=(),
-        active=active,
-        every=1,
-    )
-
-
-PLAN = Plan(
-    robot="pair",
-    loop=LoopPlan(
-        period_ns=PERIOD_NS,
-        scheduler=SchedulerPlan("other", 1, False),
-        joints=(JointPlan("pan", -1.0, 1.0, None), JointPlan("tilt", -1.0, 1.0, None)),
-        controllers=(
-            controller("left", "pan"),
-            controller("right", "tilt"),
-            controller("spare", "pan", False),
-        ),
-        commands=(),
-        end_ns=None,
-    ),
-    buses=(),
-    exit_timeout_ns=1,
-    recording=RecordingPlan("logs"),
-    source_file="pair.yaml",
-    source_text="",
-    arguments={},
-    groups={"both": ("pan", "tilt")},
-)
+        return plan_of(file)
 
 
 class Desk:
     """The loop's end of a link, and a client's end of the gateway; the loop does nothing by itself."""
 
-    def __init__(self, plan=PLAN, plugins=None):
+    def __init__(self, text="controllers.txt", offered=None):
+        plan = plan_in(text)
         memory = Descriptors(
             heartbeat=heartbeat.create(),
             cycles=ring.create("cycles", 8192, 1000),
@@ -256,12 +212,11 @@ class Desk:
         self.message_ring = ring.RingWriter(memory.messages)
         self.messages = MessageRing(self.message_ring)
         self.link = Link(plan, memory)
-        plugins = plugins or PlugIns({"arm": Offer("arm", Arm, "tests 1")}, {})
         self.gateway = GatewayApp(
             self.link,
             Preparation(
                 {joint.name: joint for joint in plan.loop.joints},
-                plugins,
+                offered or plugins(),
                 groups=plan.groups,
                 omitted=plan.omitted,
             ),
@@ -380,7 +335,7 @@ def desk(no_memory_left):
 
 @pytest.fixture
 def desk_of(no_memory_left):
-    """Make a desk of another plan, with its plug-ins."""
+    """Make a desk of another text's robot."""
     return Desk
 
 

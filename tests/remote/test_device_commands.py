@@ -4,7 +4,6 @@ import json
 
 import msgspec
 import pytest
-from tests.remote.conftest import plugins
 
 from dxlrun.cli.steering.joints import facts, source_facts
 from dxlrun.messages.cdr import Codec
@@ -13,8 +12,8 @@ from dxlrun.remote.live.states import RobotStates, array
 
 
 @pytest.fixture
-def board(desk_of, plan_in):
-    desk = desk_of(plan_in("devices.txt"), plugins())
+def board(desk_of):
+    desk = desk_of("devices.txt")
     desk.record.sources.values[0], desk.record.sources.valid[0] = 12.5, True
     desk.record.sources.age_ns[0] = 3_000_000
     desk.finish_cycle()

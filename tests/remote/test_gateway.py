@@ -509,7 +509,7 @@ def test_poses_that_take_long_are_interrupted(monkeypatch):
     monkeypatch.setattr(Poses, "find_positions", lambda *_: time.sleep(DEADLINE_S))
     motions = {"a": {"steps": [{"time": "1 s", "pose": "rest"}]}}
     entry = {"name": "more", "type": "keyframe_player", "joints": ["pan"], "motions": motions}
-    status, content = Desk(plugins=load_plugins()).ask("POST", "/controllers", entry)
+    status, content = Desk(offered=load_plugins()).ask("POST", "/controllers", entry)
     assert (status, content["refused"].partition(" s ")[0]) == (422, "more needed more than 0.05")
 
 
@@ -524,7 +524,7 @@ class WatchedOffers(dict):
 
 def test_import_of_a_controller_that_is_loaded_is_not_interrupted():
     offers = WatchedOffers(arm=Offer("arm", Arm, "tests 1"))
-    desk = Desk(plugins=PlugIns(offers, {}))
+    desk = Desk(offered=PlugIns(offers, {}))
     status, content = desk.ask("POST", "/controllers", {"name": "more", "type": "arm", "joints": ["pan"]})
     assert (status, 0 < offers.timer[0] <= preparation.BUDGET_S) == (200, False), (
         content

@@ -7,15 +7,11 @@ from typing import Annotated
 import msgspec
 import pytest
 from pydantic import model_validator
-from tests.remote.conftest import GoalArm, GoalParameters, plugins
+from tests.remote.conftest import GoalArm, GoalParameters
 
 import dxlrun
 from dxlrun.channels.event_records import EventBody, EventCode, GoalReport, Severity
 from dxlrun.channels.heartbeat import Phase
-from dxlrun.channels.topic_messages import PublishedTopic
-from dxlrun.control.controllers.goal_registry import GoalStatus as LoopStatus
-from dxlrun.control.controllers.published_topics import TopicLog
-from dxlrun.messages.declared import declared_message
 from dxlrun.remote import gateway
 from dxlrun.remote.goal_book import KEPT_GOALS
 
@@ -23,9 +19,9 @@ PARAMETERS = "/controllers/left/parameters"
 
 
 @pytest.fixture
-def arm(desk_of, plan_in):
+def arm(desk_of):
     """A desk whose controllers take goals and have live parameters."""
-    return desk_of(plan_in("../sessions/goals.txt"), plugins())
+    return desk_of("../sessions/goals.txt")
 
 
 def report(desk, number, status, controller="left", **more):
@@ -33,22 +29,6 @@ def report(desk, number, status, controller="left", **more):
     data = msgspec.json.encode(GoalReport(number, controller, "go", "anna", status, **more))
     desk.events.emit_event(controller, EventBody(code, Severity.INFO, f"goal {number} {status}"), data)
     desk.link.collect_messages()
-
-
-def test_progress_is_that_of_the_topic(arm):
-    topic = PublishedTopic("/goals", declared_message(LoopStatus, "dxlrun_msgs").type)
-    publisher = TopicLog(arm.record, arm.messages).open("/goals", LoopStatus)
-    assert publisher.topic == topic
-    report(arm, 1, "accepted")
-    for progress in (0.1, 0.2, 0.3):
-        publisher.publish(LoopStatus(goal=1, status="running", progress=progress))
-    arm.link.collect_messages()
-    goal = arm.ask("GET", "/goals/1")[1]
-    assert (goal["progress"], goal["error"]) == (0.3, None)
-    publisher.publish(LoopStatus(goal=1, status="running", progress=0.4, error=0.02))
-    arm.link.collect_messages()
-    (goal,) = arm.ask("GET", "/goals")[1]["running"]
-    assert (goal["progress"], goal["error"]) == (0.4, 0.02)
 
 
 def test_feedback_that_is_none_changes_nothing(arm):

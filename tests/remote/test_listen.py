@@ -25,21 +25,6 @@ from dxlrun.remote.live.live_topics import framed
 from dxlrun.remote.requests.replies import RunEnded, StreamMessage, StreamTopic
 from dxlrun_analysis.replay import replay_log
 
-ROBOT = """\
-name: publisher
-buses:
-  main:
-    port: sim
-    protocol: 1.0
-    baud_rate: 1_000_000
-    return_delay_time: 100 us
-    adapter: {latency: 1 ms}
-loop: {rate: 100, tolerated_skips: 100 %}
-joints:
-  pan: {bus: main, id: 3, model: AX-12A, reference: 150 deg, direction: 1}
-controllers:
-  count: {type: count}
-"""
 PLUGIN = """\
 from dataclasses import dataclass
 
@@ -250,8 +235,7 @@ def running(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Running
     (tmp_path / "run").mkdir(mode=0o700)
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "run"))
     runs = LiveRuns(tmp_path)
-    (tmp_path / "publisher.yaml").write_text(ROBOT)
-    yield runs.start("--duration", "300", robot=tmp_path / "publisher.yaml", plugins=tmp_path, gateway=True)
+    yield runs.start("type:=count", "--duration", "300", plugins=tmp_path, gateway=True)
     runs.end()
 
 
@@ -263,17 +247,17 @@ def test_messages_come_live_until_the_run_ends_and_are_all_in_the_log(
 ) -> None:
     until(dxlrun.running, check=running.lives)
     with dxlrun.connect() as robot:
-        (state,) = [one for one in robot.topics() if one.name == "/count/state"]
-        assert (state.type, state.joints) == ("my_robotics/msg/Count", ("pan",))
-        with pytest.raises(dxlrun.Refused, match="there is no topic /count/states; there are /count/state"):
-            robot.newest("/count/states")
+        (state,) = [one for one in robot.topics() if one.name == "/states/state"]
+        assert (state.type, state.joints) == ("my_robotics/msg/Count", ("pan", "tilt"))
+        with pytest.raises(dxlrun.Refused, match="no topic /states/states; there are /states/state"):
+            robot.newest("/states/states")
         found = []
-        sleeper = robot.listen("/count/state", "/joint_states")  # takes nothing before the end
+        sleeper = robot.listen("/states/state", "/joint_states")  # takes nothing before the end
         request.addfinalizer(sleeper.close)
         killed = subprocess.Popen([sys.executable, "-c", LISTENER], stdout=subprocess.PIPE)
         assert killed.stdout is not None
         killed.stdout.readline()
-        for message in robot.listen("/count/state"):
+        for message in robot.listen("/states/state"):
             found.append(message)
             if len(found) == 10:
                 killed.send_signal(signal.SIGKILL)
@@ -285,11 +269,11 @@ def test_messages_come_live_until_the_run_ends_and_are_all_in_the_log(
     assert code == 0 or "did not respond" in said, said  # the machine may have had no processor for it
     log = running.log_path()
     assert log is not None
-    topic = read_log(log).topics["/count/state"]
+    topic = read_log(log).topics["/states/state"]
     assert topic.column("number").tolist() == [*range(len(topic.data) - 1), -1]
     late = list(sleeper)
     states = [one for one in late if one.topic == "/joint_states"]
-    for each in (found, [one for one in late if one.topic == "/count/state"], states):
+    for each in (found, [one for one in late if one.topic == "/states/state"], states):
         numbers = [one.number for one in each]
         assert numbers[-1] - numbers[0] + 1 == len(numbers) + sum(one.lost for one in each)
     assert found[-1].number == len(topic.data)
@@ -301,5 +285,5 @@ def test_messages_come_live_until_the_run_ends_and_are_all_in_the_log(
     monkeypatch.syspath_prepend(tmp_path)
     replayed = replay_log(log)
     assert (replayed.sentence, replayed.messages) == (
-        f"publisher: {replayed.cycles} cycles replayed, 0 differences", len(topic.data),
+        f"pair: {replayed.cycles} cycles replayed, 0 differences", len(topic.data),
     )  # fmt: skip

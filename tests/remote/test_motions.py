@@ -1,6 +1,6 @@
 # ruff: noqa: E501 (motions and their mistakes are read best side by side)
 
-"""Motions for a robot that runs: what is refused and where, the way to the first poses, and the speed."""
+"""Motions for a robot that runs: the way to the first poses, and the speed; refusals: sessions/motions.txt."""
 
 import asyncio
 import json
@@ -10,6 +10,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from dxlrun.channels.answers import Completion
 from dxlrun.control.controllers.plugin_loading import Offer, PlugIns
@@ -17,32 +18,14 @@ from dxlrun.plan.loop_plan import ControllerPlan, JointPlan, ServoLimit
 from dxlrun.remote import gateway
 from dxlrun.remote.preparation import Preparation
 from dxlrun.remote.requests.request_table import Role
-from dxlrun_controllers import group
 from dxlrun_controllers.motions.joint_trajectory_controller import JointTrajectoryController
 from dxlrun_controllers.motions.keyframe_player import KeyframePlayer
 
-JOINTS = (JointPlan("pan", -1.0, 1.0, 2.0), JointPlan("tilt", -1.0, 1.0, 2.0))
-TYPES = {
-    "positions": (group.JointGroupPositionController, ("pan",)),
-    "posvel": (group.JointGroupPosVelController, ("tilt",)),
-    "arm": (JointTrajectoryController, ("tilt",)),
-    "wheel": (group.JointGroupVelocityController, ("tilt",)),
-}
-
 
 @pytest.fixture
-def head(desk):
-    """The desk with a controller of each type; the last two are not active. Both joints are at 0.2 rad."""
-    offers = {name: Offer(name, cls, "tests 1") for name, (cls, _) in TYPES.items()}
-    desk.gateway._preparation = Preparation({joint.name: joint for joint in JOINTS}, PlugIns(offers, {}))
-    desk.app = desk.gateway.app()
-    loaded = type(next(iter(desk.link.controllers.values())))
-    desk.link.controllers = {}
-    for place, (name, (_, joints)) in enumerate(TYPES.items()):
-        plan = ControllerPlan(
-            name, name, "tests 1", json.dumps({"joints": joints}), joints, ("position",), (), True, 1
-        )
-        desk.link.controllers[name] = loaded(plan, place)
+def head(desk_of):
+    """A desk with controllers of four types; the last two are not active. Both joints are at 0.2 rad."""
+    desk = desk_of("../sessions/motions.txt")
     activate(desk, "positions", "posvel")
     for array in desk.record.goals.values:
         array.fill(np.nan)
@@ -52,7 +35,7 @@ def head(desk):
 
 
 def activate(desk, *names):
-    desk.record.active = sum(1 << list(TYPES).index(name) for name in names)
+    desk.record.active = sum(1 << [*desk.link.controllers].index(name) for name in names)
     desk.finish_cycle()
 
 
@@ -170,57 +153,6 @@ def test_wheels_have_no_way_to_a_first_pose(head):
 
 POINT = "    points: [{time: 0 s, joints: {%s}}]\n"
 HEAD = "name: nod\nmotions:\n  - controller: %s\n"
-WRONG = [
-    (HEAD % "leg" + POINT % "pan: {position: 0 rad}", "3:17", "the robot has no controller leg", "known: arm"),
-    (HEAD % "arm" + POINT % "tilt: {position: 0 rad}", "3:17", "controller arm is not active", "activate it by `dxlrun switch --activate arm --deactivate posvel`"),
-    (HEAD % "positions" + POINT % "pan: {position: 2 rad}", "4:35", "pan is sent to 114.59 deg", "change the motion or the limits"),
-    (HEAD % "posvel" + POINT % "tilt: {position: 0 rad, velocity: 9 rad/s}", "4:35", "tilt is commanded to 9 rad/s", "allow more time"),
-    (HEAD % "positions" + POINT % "tilt: {position: 0 rad}", "4:35", "positions does not move tilt", "known: pan"),
-    (HEAD % "posvel" + POINT % "tilt: {position: 0 rad}", "4:35", "tilt has no target velocity at", "add the velocity"),
-    (HEAD % "positions" + POINT % "pan: {position: 0}", "4:51", "0 has no unit", "60 deg"),
-    ("name: nod\n", "1:1", "motions", ""),
-    ("name: [\n", "1:7", "", ""),
-    (NOD + NOD.split("motions:\n")[1].split("  - controller: posvel", maxsplit=1)[0], "14:9", "this part begins before the end of the previous part", "start it later"),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize("wrong", WRONG, ids=[f"{one[2]}" for one in WRONG])
-def test_a_motion_that_cannot_be_played_is_refused_with_its_places(head, wrong):
-    text, place, what, fix = wrong
-    status, answer, taken = play(head, text)
-    assert (status, answer["code"], taken) == (422, "wrong_motion", []), answer
-    fields = answer["fields"]
-    assert (fields["places"][0], what in fields["problems"][0], fix in fields["fixes"][0]) == (
-        place,
-        True,
-        True,
-    ), fields
-    assert f"wave.yaml:{place}: " in answer["refused"]
-
-
-def test_all_mistakes_come_together(head):
-    text = (
-        HEAD % "leg"
-        + POINT % "pan: {position: 0 rad}"
-        + "  - controller: positions\n"
-        + POINT % "pan: {position: 2 rad}"
-    )
-    assert len(play(head, text)[1]["fields"]["places"]) == 2
-
-
-@pytest.mark.parametrize("speed", [0, -1, 11, 1e-400])
-def test_a_speed_that_is_none_is_refused(head, speed):
-    status, answer, taken = play(head, NOD, speed)
-    assert (status, taken) == (422, [])
-    assert "write a factor from 0.01 to 10" in answer["refused"]
-
-
-def test_a_joint_that_has_not_answered_yet_is_named(head):
-    head.record.states.position[0] = np.nan
-    head.finish_cycle()
-    _, answer, taken = play(head, NOD)
-    assert taken == []
-    assert "pan has not answered yet" in answer["refused"]
 
 
 def test_a_motion_that_is_too_long_is_refused(head, monkeypatch):
@@ -298,7 +230,8 @@ def lead_to(head, position):
 
 
 def test_a_joint_that_is_slower_than_the_soft_speed_gets_its_own_time(head):
-    head.gateway._preparation.joints["pan"] = JointPlan("pan", -1.0, 1.0, 0.25)
+    joints = head.gateway._preparation.joints
+    joints["pan"] = replace(joints["pan"], velocity=0.25)
     assert lead_to(head, 0.7)[0][-1] == pytest.approx(2.0)
 
 
@@ -330,5 +263,5 @@ def test_motion_that_loops_has_no_length():
     player = PlugIns({"player": Offer("player", KeyframePlayer, "tests 1")}, {})
     keys = json.dumps({"joints": ["pan"], "motions": motions})
     plan = ControllerPlan("pages", "player", "tests 1", keys, ("pan",), ("position",), (), True, 1)
-    prepared = Preparation({joint.name: joint for joint in JOINTS}, player)
+    prepared = Preparation({"pan": JointPlan("pan", -1.0, 1.0, 2.0)}, player)
     assert prepared.motions(plan) == {"once": 0.5, "round": None}

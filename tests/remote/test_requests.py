@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from jsonschema import Draft202012Validator
 from tests.kit.cases import read_lines
-from tests.remote.conftest import TEXTS, plugins
+from tests.remote.conftest import TEXTS
 
 from dxlrun.channels.answers import Completion
 from dxlrun.remote.gateway import _HANDLERS
@@ -119,13 +119,11 @@ def cases() -> Iterator[Any]:
 
 
 @pytest.mark.parametrize("case", [*cases()])
-def test_each_request_is_refused_or_reaches_the_loop_as_written(
-    desk_of: Any, plan_in: Any, case: Case
-) -> None:
+def test_each_request_is_refused_or_reaches_the_loop_as_written(desk_of: Any, case: Case) -> None:
     line = re.fullmatch(r"(\S+) (\S+) ?(.*) => (?:(\d+) (\w+)|to (\w+)): (.*)", case.line)
     assert line, f"{case.place}: write METHOD PATH BODY => STATUS CODE: SENTENCE, or to NAME: KIND DATA"
     method, path, body, status, code, controller, told = line.groups()
-    desk = desk_of(plan_in(case.file), plugins())
+    desk = desk_of(case.file)
     controllers = enumerate(desk.link.plan.loop.controllers)
     desk.record.active = sum(1 << bit for bit, controller in controllers if controller.active)
     arrays = {"goals": desk.record.goals.position, "positions": desk.record.states.position}

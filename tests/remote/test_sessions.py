@@ -6,6 +6,7 @@ The texts have the form of `tests/kit/cases.py`; the head is a robot file. Lines
     GET /goals/9 => 404 unknown_goal: no goal 9       code, and a part of the sentence
     took loop rate {"rate": 100.0}                    the next command that the loop got: JSON, or an array
     took nothing                                      no further command
+    play arm pan: {position: 0 rad} => 200            a motion with one point: its controller and joints
 
 What is not a request happens to the robot: see `HAPPENINGS`. Commands are done as the loop does them, or
 answered as `loop answers` has it: a completion, or a refusal with its code.
@@ -21,7 +22,7 @@ import msgspec
 import numpy as np
 import pytest
 from tests.kit.cases import TextCase, case_parameters
-from tests.remote.conftest import Desk, plugins
+from tests.remote.conftest import Desk
 
 from dxlrun.channels.answers import Code, Completion, Refusal
 from dxlrun.channels.event_records import EventBody, EventCode, GoalReport, Severity
@@ -62,6 +63,11 @@ class Session:
             assert (content["code"], sentence in content["refused"]) == (code, True), content
         elif told:
             assert is_part(json.loads(told), content), content
+
+    def play(self, controller: str, joints: str, status: str, told: str) -> None:
+        points = f"points: [{{time: 0 s, joints: {{{joints}}}}}]"
+        text = f"name: nod\nmotions:\n  - controller: {controller}\n    {points}\n"
+        self.request("POST", "/play", json.dumps({"file": "wave.yaml", "text": text}), status, told)
 
     def took(self, controller: str, kind: str, data: str) -> None:
         taken = self.desk.taken.pop(0)
@@ -124,6 +130,7 @@ class Session:
 
 
 HAPPENINGS = {
+    r"play (\w+) (.*?) => (\d+) ?(.*)": Session.play,
     r"took nothing": Session.took_nothing,
     r"took (\w+) (\w+) ?(.*)": Session.took,
     r"loop answers (\{.*\})": Session.answers,  # {}: as it does by itself
@@ -139,8 +146,8 @@ HAPPENINGS = {
 
 
 @pytest.mark.parametrize("case", case_parameters(Path(__file__).with_name("sessions")))
-def test_session(desk_of: Any, plan_in: Any, case: TextCase) -> None:
-    session = Session(desk_of(plan_in(f"../sessions/{case.file.name}"), plugins()))
+def test_session(desk_of: Any, case: TextCase) -> None:
+    session = Session(desk_of(f"../sessions/{case.file.name}"))
     session.activate(" ".join(one.name for one in session.plan.controllers if one.active))
     for array in (*session.desk.record.goals.values, session.desk.record.states.position):
         array.fill(math.nan)

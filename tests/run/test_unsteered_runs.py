@@ -3,13 +3,10 @@
 from pathlib import Path
 
 import pytest
-from tests.kit.awaited import DEADLINE_S, until
+from tests.kit.awaited import until
 from tests.kit.commands import Dxlrun, command_line
 from tests.kit.live_run import GOAL_POSITION, PAIR, ROBOT, Running, Start
 from tests.kit.wire import all_writes
-
-from dxlrun.remote.sockets import sockets
-from dxlrun.run.unsteered import unsteered_runs
 
 POSE = """\
 poses: {raised: {pan: 40 deg, tilt: 40 deg}}
@@ -55,29 +52,3 @@ def test_stop_leaves_a_run_that_is_already_ending_its_pose(
     assert "cut" not in out + err
     assert abs(pan_goals(running)[-1] - RAISED) <= 2
     assert running.is_limp()
-
-
-@pytest.mark.timeout(300)  # several runs
-def test_stop_ends_the_run_that_listens_under_the_name_and_refuses_one_of_several_others(
-    dxlrun: Dxlrun, start: Start, tmp_path: Path
-) -> None:
-    robot = robot_file(tmp_path, "twin_arm")
-    steered = start(robot=robot, gateway=True)
-    until(lambda: "twin_arm" in sockets(), "the socket", check=steered.lives)
-    bare = [start(robot=robot) for _ in range(2)]
-    names = {f"twin_arm-{one.process.pid}" for one in bare}
-    until(lambda: names <= {run.name for run in unsteered_runs() if run.problem}, "the other runs")
-    listed = dxlrun("list")
-    assert listed.out.startswith("twin_arm: 50 Hz")
-    for name in names:
-        assert f"dxlrun: {name} {NO_GATEWAY}" in listed.err
-    assert "--robot twin_arm, " in dxlrun("stop").err
-    assert dxlrun("stop", "--robot", "twin_arm") == (0, "twin_arm has ended\n", "")
-    assert steered.finish()[0] == 0
-    said = dxlrun("stop", "--robot", "twin_arm")
-    assert said.code == 2
-    assert all(f"--robot {name}" in said.err for name in names)
-    assert [one.process.poll() for one in bare] == [None, None]
-    for one in bare:  # the last one is the only one of that name
-        assert dxlrun("stop", "--robot", f"twin_arm-{one.process.pid}").out.startswith("twin_arm")
-        assert one.process.wait(DEADLINE_S) == 0
