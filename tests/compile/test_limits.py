@@ -12,9 +12,7 @@ import pytest
 from tests.kit.robots import compile_text, robot_text
 
 from dxlrun.cli import check
-from dxlrun.compile.joints.limits import Interval, beyond_limits, check_samples, degrees, limits_of
-from dxlrun.compile.motion_samples import MotionSample, SampledTarget
-from dxlrun.compile.problems import Problems
+from dxlrun.compile.joints.limits import Interval, beyond_limits, degrees, limits_of
 from dxlrun.compile.robot_compiler import compile_files
 from dxlrun.contract.controller import CommandModel, SpeedPeak
 from dxlrun.control.controllers.plugin_loading import load_plugins
@@ -73,66 +71,6 @@ def test_intervals_meet_in_the_tighter_bound_of_each_side() -> None:
 def test_positions_are_written_with_their_signs_and_short() -> None:
     assert (str(limits_of(ARM)), str(limits_of(SLIDE))) == ("-57.3..+28.65 deg", "-20..+50 mm")
     assert [degrees(value) for value in (math.radians(60), -1e-9, 1.77)] == ["60", "0", "101.41"]
-
-
-def samples(*rows: tuple[float, float | None, float | None]) -> list[MotionSample]:
-    """Return samples of `arm`: time s, position, velocity; in the lines 3, 4, ..."""
-    return [
-        MotionSample(
-            round(t * SOME_S), {"arm": SampledTarget(position, velocity, None, Mark("m.yaml", line))}, MARK
-        )
-        for line, (t, position, velocity) in enumerate(rows, 3)
-    ]
-
-
-def told_of(listed: list[MotionSample], *peaks: SpeedPeak) -> list[str]:
-    problems = Problems()
-    check_samples(listed, 2 * SOME_S, {"arm": ARM}, problems, peaks)
-    return [str(one).removeprefix("m.yaml:") for one in (*problems.errors, *problems.warnings)]
-
-
-@pytest.mark.parametrize(
-    ("positions", "told"),
-    [
-        ((-1.0, 0.5), []),
-        ((-1.0 - 5e-7, 0.5 + 5e-7), []),
-        ((0.0, -1.01), ["4:1: warning: arm is sent to -57.87 deg at 3.000 s"]),
-        ((0.51, 0.0), ["3:1: warning: arm is sent to 29.22 deg at 2.000 s"]),
-        ((-1.1, 0.7), ["4:1: warning: arm is sent to 40.11 deg at 3.000 s"]),
-        ((-1.3, 0.7), ["3:1: warning: arm is sent to -74.48 deg at 2.000 s"]),
-    ],
-)
-def test_worst_target_beyond_either_limit_is_reported_once(
-    positions: tuple[float, ...], told: list[str]
-) -> None:
-    found = told_of(samples(*((index, position, None) for index, position in enumerate(positions))))
-    assert [one.partition(f", {RANGE}")[0] for one in found] == told
-
-
-def peak(speed: float, time: float) -> SpeedPeak:
-    return SpeedPeak("arm", speed, time, "from point 1 to 2")
-
-
-@pytest.mark.parametrize(
-    ("rows", "peaks", "told"),
-    [
-        (((0, 0.0, 2.0), (1, 0.0, -2.0)), [peak(-2.0, 0.5)], []),
-        (((0, 0.0, -2.1),), [], [f"3:1: warning: arm is commanded to 2.1 rad/s at 2.000 s, {ARM_SPEED}"]),
-        (((0, 0.0, 2.1), (1, 0.0, -7.9)), [], ["4:1: warning: arm is commanded to 7.9 rad/s at 3.000 s"]),
-        (((0, 0.0, -8.1),), [], [f"3:1: arm is commanded to 8.1 rad/s at 2.000 s, {FREE_SPEED}"]),
-        (((0, -0.5, None), (0.25, 0.5, None)), [], []),  # nothing moves between the two
-        (((0, -0.5, None), (0.25, 0.5, None)), [peak(4.0, 0.25)], ["4:1: warning: arm is commanded to 4 rad/s at 2.250 s"]),
-        (((0, 0.5, 0.0), (0.25, -0.5, 0.0)), [peak(-6.0, 0.125)], ["4:1: warning: arm is commanded to 6 rad/s at 2.125 s"]),
-        (((0, 0.5, 0.0), (0.1, -0.5, 0.0)), [peak(-15.0, 0.05)], ["4:1: arm is commanded to 15 rad/s at 2.050 s"]),
-        (((0, 0.5, 3.0), (0.1, 0.5, 0.0)), [peak(-2.5, 0.05)], ["3:1: warning: arm is commanded to 3 rad/s at 2.000 s"]),
-        (((0, 0.0, 0.0), (1, 0.4, 0.0), (2, -0.4, 0.0)), [peak(-2.4, 1.5)], ["5:1: warning: arm is commanded to 2.4 rad/s at 3.500 s"]),
-    ],
-)  # fmt: skip
-def test_speeds_of_either_sign_are_compared(
-    rows: tuple[tuple[float, float | None, float | None], ...], peaks: list[SpeedPeak], told: list[str]
-) -> None:
-    found = told_of(samples(*rows), *peaks)
-    assert [one[: len(start)] for one, start in zip(found, told, strict=True)] == told
 
 
 def trajectory(*points: tuple[float, tuple[float, float]], **more: object) -> TrajectoryCommand:

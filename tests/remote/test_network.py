@@ -14,7 +14,7 @@ from tests.kit.campaigns import campaign
 from tests.remote.conftest import STOP, Door
 
 from dxlrun.channels.answers import Code
-from dxlrun.errors import DxlrunError, InputError
+from dxlrun.errors import DxlrunError, InputError, Refused
 from dxlrun.remote.asked import LONGEST_ORIGIN
 from dxlrun.remote.client import RemoteRobot, connect
 from dxlrun.remote.network.certificates import client_context, counts, keys_place, server_context
@@ -110,6 +110,18 @@ def test_a_client_looks_listens_and_commands_as_on_the_robots_own_computer(net):
         ("stop", "client admin: test"),
     ]
     assert json.loads(net.desk.taken[0].data) == {"client": "client admin", "instead": "this computer"}
+
+
+def test_certificate_decides_the_role(net):
+    def act():
+        with net.robot("observe") as robot:
+            assert robot.info()["robot"] == "pair"
+            with pytest.raises(Refused) as refused:
+                robot.halt()
+            assert refused.value.code == Code.NOT_ALLOWED
+
+    net.while_served(act)
+    assert net.desk.taken == []
 
 
 def test_a_robot_has_the_name_by_which_it_can_be_connected_again(net):
