@@ -1,7 +1,5 @@
 """Joints with several servos and linear joints, as clients name and command them."""
 
-import json
-
 import pytest
 from msgspec.structs import replace
 
@@ -16,7 +14,7 @@ from dxlrun.remote.named.named_joints import (
     read_register,
     require_reboots,
 )
-from dxlrun.remote.preparation import RefusedRequest, in_si, plain_quantities
+from dxlrun.remote.preparation import RefusedRequest
 from dxlrun_lab.guided.choice import require_own_servos
 
 ROBOT = """\
@@ -104,22 +102,3 @@ def test_units_are_those_of_the_joint(plan: Plan) -> None:
         "pitch": "A",
         "roll": "A",
     }
-
-
-def test_a_command_has_lengths_for_linear_joints_and_angles_for_others(plan: Plan) -> None:
-    joints = [joint for joint in plan.loop.joints if joint.name in {"head", "slide"}]
-    command = json.dumps({"positions": ["90 deg", "5 mm"], "velocities": ["1 rad/s", "20 mm/s"]}).encode()
-    plain = json.loads(in_si(command, "go", joints))
-    assert plain["positions"] == pytest.approx([1.5708, 0.005], abs=1e-4)
-    assert plain["velocities"] == pytest.approx([1.0, 0.02])
-    named = json.dumps({"joints": ["slide"], "points": [{"time": "1 s", "positions": ["5 mm"]}]}).encode()
-    assert json.loads(in_si(named, "go", joints))["points"][0]["positions"] == [0.005]
-    assert plain_quantities({"slide": "5 mm", "head": "1 rad"}, "positions", joints) == {
-        "slide": 0.005,
-        "head": 1.0,
-    }
-    for wrong in (["90 deg", "5 deg"], ["90 mm", "5 mm"]):
-        with pytest.raises(RefusedRequest):
-            in_si(json.dumps({"positions": wrong}).encode(), "go", joints)
-    with pytest.raises(RefusedRequest, match="slide: "):
-        plain_quantities({"slide": "5 deg"}, "positions", joints)
