@@ -13,32 +13,21 @@ from dxlwire.wire.protocol1 import Status, StatusError
 from dxlwire.wire.receiver import Receiver
 
 ids = st.integers(0, p1.HIGHEST_ID)
-GOALS = {0: "10 00 50 01", 1: "20 02 60 03", 2: "30 00 70 01", 3: "20 02 80 03"}
+GOALS = {0: b"\x10\0\x50\1", 1: b"\x20\2\x60\3", 2: b"\x30\0\x70\1", 3: b"\x20\2\x80\3"}
+INSTRUCTIONS_1 = {
+    "01 02 01 fb": p1.ping(1),
+    "01 04 02 2b 01 cc": p1.read_range(1, 0x2B, 1),
+    "fe 04 03 03 01 f6": p1.write_range(0xFE, 3, b"\x01"),
+    "00 02 06 f7": p1.factory_reset(0),
+    "fe 18 83 1e 04 00 10005001 01 20026003 02 30007001 03 20028003 12": p1.sync_write(30, 4, GOALS),
+}
 
 
-def parsed(packet):
-    """Return the status of a whole packet; None: header, length or checksum are wrong."""
+def parsed(packet, dialect=p1):
+    """Return the status of a whole packet; None: header, length or checksum are wrong, or it is no status."""
     view = memoryview(bytes(packet))
-    whole = packet.startswith(p1.HEADER) and p1.size_at(view, 0, len(view)) == len(view)
-    return p1.opened(view) if whole and p1.intact(view) else None
-
-
-@pytest.mark.parametrize(
-    ("packet", "example"),
-    [
-        (p1.ping(1), "ff ff 01 02 01 fb"),
-        (p1.read_range(1, 0x2B, 1), "ff ff 01 04 02 2b 01 cc"),
-        (p1.write_range(0xFE, 3, b"\x01"), "ff ff fe 04 03 03 01 f6"),
-        (p1.factory_reset(0), "ff ff 00 02 06 f7"),
-        (
-            p1.sync_write(30, 4, {servo_id: bytes.fromhex(data) for servo_id, data in GOALS.items()}),
-            "ff ff fe 18 83 1e 04 00 10 00 50 01 01 20 02 60 03 02 30 00 70 01 03 20 02 80 03 12",
-        ),
-    ],
-    ids=["ping", "read", "write", "factory reset", "sync write"],
-)
-def test_the_manuals_instructions(packet, example):
-    assert packet.hex(" ") == example
+    whole = packet.startswith(dialect.HEADER) and dialect.size_at(view, 0, len(view)) == len(view)
+    return dialect.opened(view) if whole and dialect.intact(view) else None
 
 
 def test_the_manuals_status_packets():
@@ -144,16 +133,12 @@ def printed(example):
     return p2.HEADER + bytes.fromhex(example)
 
 
-def parsed_2(packet):
-    """Return the status of a whole packet; None: it is an instruction, or length or CRC are wrong."""
-    view = memoryview(packet)
-    whole = packet.startswith(p2.HEADER) and p2.size_at(view, 0, len(view)) == len(view)
-    return p2.opened(view) if whole and p2.intact(view) else None
-
-
-@pytest.mark.parametrize("example", INSTRUCTIONS)
-def test_the_manuals_instructions_of_protocol_2(example):
-    assert INSTRUCTIONS[example] == printed(example)
+@pytest.mark.parametrize(
+    ("dialect", "example"),
+    [*((p1, example) for example in INSTRUCTIONS_1), *((p2, example) for example in INSTRUCTIONS)],
+)
+def test_the_manuals_instructions(dialect, example):
+    assert (INSTRUCTIONS | INSTRUCTIONS_1)[example] == dialect.HEADER + bytes.fromhex(example)
 
 
 @pytest.mark.parametrize("example", MISPRINTS)
@@ -167,7 +152,7 @@ def test_the_manuals_misprints_are_not_what_goes_over_the_line(example):
 @pytest.mark.parametrize("example", STATUSES)
 def test_the_manuals_statuses(example):
     status = STATUSES[example]
-    assert parsed_2(printed(example)) == status
+    assert parsed(printed(example), p2) == status
     assert p2.status_packet(status.servo_id, status.error, bytes(status.parameters)) == printed(example)
 
 
@@ -205,7 +190,7 @@ def test_crc_and_stuffing_are_what_the_sdk_would_do_if_it_kept_the_result(data, 
 @settings_2
 def test_a_status_survives_the_line(servo_id, error, data):
     packet = p2.status_packet(servo_id, error, data)
-    assert parsed_2(packet) == (servo_id, error, data)
+    assert parsed(packet, p2) == (servo_id, error, data)
     assert b"\xff\xff\xfd\x00" not in packet[4:-2]
     assert p2.size_at(packet, 0, len(packet)) == len(packet)
     assert len(packet) <= p2.widest(len(data)) + 1  # FF FF FD may begin at INST
@@ -226,7 +211,7 @@ def test_no_status_is_wider_than_its_widest(length):
 def test_a_status_that_is_none():
     good = p2.status_packet(1, 0, b"\1\2")
     for wrong in (good[:-1], good[:-1] + b"\0", b"\xff" + good, p2.ping(1) + b"\0", p2.read_range(1, 0, 2)):
-        assert parsed_2(wrong) is None
+        assert parsed(wrong, p2) is None
     assert p2.opened(memoryview(p2.instruction_packet(1, p2.STATUS))) is None, "it has no error byte"
 
 

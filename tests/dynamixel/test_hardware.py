@@ -506,12 +506,6 @@ def test_servos_of_old_firmware_are_read_plainly_and_it_is_reported():
     assert "2.76 ms instead of 2.28 ms (at most 362 Hz)" in text
 
 
-def test_who_has_no_fast_form_is_read_beside_those_who_have_one():
-    models = ["XM430-W350"] * 4 + ["2XL430-W250"] * 2
-    plan = make_x((1, 2, 3, 4, 5, 6), models=models, return_delay_ns=100_000, fast=True)
-    assert (plan.groups, plan.fast) == (((0, 1, 2, 3), (4, 5)), (True, False))
-
-
 def test_replies_are_due_by_the_return_delays_that_the_servos_have():
     rig = make_rig(plan := make_plan((1, 2), return_delay_ns=100_000))
     rig.servo(2).poke("return_delay_time", 250)
@@ -530,6 +524,7 @@ def test_replies_are_due_by_the_return_delays_that_the_servos_have():
         (2.0, ["2XL430-W250"] * 3, 0, "sync read"),
         (2.0, ["XM430-W350"], 0, "read"),
         (2.0, ["XM430-W350"] * 8, 0, "fast sync read"),
+        (2.0, ["XM430-W350"] * 4 + ["2XL430-W250"] * 2, 0, "fast sync read + sync read"),
         (2.0, ["XM430-W350"] * 3 + ["PM42-010-S260"] * 3, 0, "fast bulk read"),
         (2.0, ["2XL430-W250"] * 8 + ["XL-320"], 0, "sync read + read"),
         (2.0, ["2XL430-W250"] * 8 + ["XL-320"], 1_000_000, "bulk read"),

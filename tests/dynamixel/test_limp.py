@@ -8,6 +8,8 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from tests.kit.campaigns import campaign
@@ -25,11 +27,9 @@ from dxlrun_hand.servo_setup import bring
 from dxlsim.bus.simulated_bus import PacketFault, SimulatedBus
 from dxlsim.simulation_plan import ServoConfig
 from dxlwire.bus_plan import BusPlan
-from dxlwire.control_table import find_table
 from dxlwire.exchange.bus_engine import Lines
 from dxlwire.exchange.owed import LEAST_WINDOW_NS, SLOW_MEMORY_NS, OwedReplies
 from dxlwire.plan.line import MOST_SPARE
-from dxlwire.plan.planning import Wiring, bus_plan
 from dxlwire.plan.retry import ReplyLateness, extend_timeouts, retry
 from dxlwire.transaction import Program, Reply, Transaction
 from dxlwire.wire import protocol2
@@ -192,78 +192,63 @@ def test_torque_off_is_confirmed_while_older_readings_are_owed():
     assert not rig.servo(1).registers["torque_enable"]
 
 
-class Owed:
+READ_TORQUE, LIMP, TORQUE = ONE.reading(64, 1), ONE.writing(64, b"\0"), ONE.writing(64, b"\1")
+ALL_LIMP = ONE.line.unanswered(protocol2.sync_write(64, 1, {ONE.servo.servo_id: b"\0"}))
+MISS, WRITE = OwedReplies.add, OwedReplies.note_change
+
+
+@pytest.fixture
+def clock() -> SimpleNamespace:
+    return SimpleNamespace(now_ns=0)
+
+
+@pytest.fixture
+def owed(clock: SimpleNamespace) -> OwedReplies:
     """Owed replies of one line with a clock that the test sets."""
-
-    def __init__(self) -> None:
-        self.at_ns = 0
-        self.replies = OwedReplies(lambda: self.at_ns)
-
-    def miss(self, request: Transaction, at_ns: int) -> None:
-        self.at_ns = at_ns
-        self.replies.add(request, 0, at_ns)
-
-    def write(self, request: Transaction, at_ns: int) -> None:
-        self.at_ns = at_ns
-        self.replies.note_change(request, at_ns)
-
-    def confuses(self, request: Transaction, at_ns: int) -> bool:
-        self.at_ns = at_ns
-        return self.replies.confuses(request, request.awaited[0], refusal=False, any_age=False)
+    return OwedReplies(lambda: clock.now_ns)
 
 
-def test_retried_write_keeps_the_readings_after_its_first_attempt():
-    owed, write, read = Owed(), ONE.writing(64, b"\0"), ONE.reading(64, 1)
-    owed.write(write, 1)
-    owed.miss(read, 2)
-    owed.write(write, 3)
-    assert not owed.confuses(read, 4)
+@pytest.mark.parametrize(
+    ("steps", "asked", "confuses"),
+    [
+        # a write that is retried keeps the readings after its first attempt
+        ([(WRITE, LIMP, 1), (MISS, READ_TORQUE, 2), (WRITE, LIMP, 3)], READ_TORQUE, False),
+        # one that is repeated later invalidates them
+        (
+            [(WRITE, LIMP, 1), (MISS, READ_TORQUE, LEAST_WINDOW_NS), (WRITE, LIMP, LEAST_WINDOW_NS + 1)],
+            READ_TORQUE,
+            True,
+        ),
+        # a reading from before a write is no answer, however often it was repeated
+        ([(MISS, READ_TORQUE, 1), (WRITE, LIMP, 2), (MISS, READ_TORQUE, 3)], READ_TORQUE, True),
+        ([(MISS, READ_TORQUE, 1), (WRITE, ALL_LIMP, 2)], READ_TORQUE, True),
+        # a late acknowledgement counts for the repetition of its write, unless another came between
+        ([(WRITE, LIMP, 1), (MISS, LIMP, 1), (WRITE, LIMP, 3)], LIMP, False),
+        ([(WRITE, LIMP, 1), (MISS, LIMP, 1), (WRITE, TORQUE, 2), (WRITE, LIMP, 3)], LIMP, True),
+    ],
+)
+def test_late_reply_is_taken_for_one_to_a_later_request_only_if_it_says_the_same(
+    steps: list[tuple[Any, Transaction, int]],
+    asked: Transaction,
+    confuses: bool,
+    owed: OwedReplies,
+    clock: SimpleNamespace,
+) -> None:
+    for note, request, clock.now_ns in steps:
+        note(owed, request, *([0] if note is MISS else []), clock.now_ns)
+    clock.now_ns += 1
+    assert owed.confuses(asked, asked.awaited[0], refusal=False, any_age=False) is confuses
 
 
-def test_write_repeated_later_invalidates_older_readings():
-    owed, write, read = Owed(), ONE.writing(64, b"\0"), ONE.reading(64, 1)
-    owed.write(write, 1)
-    owed.miss(read, LEAST_WINDOW_NS)
-    owed.write(write, LEAST_WINDOW_NS + 1)
-    assert owed.confuses(read, LEAST_WINDOW_NS + 2)
-
-
-def test_reading_from_before_a_write_is_no_answer_however_often_it_was_repeated():
-    owed, write, read = Owed(), ONE.writing(64, b"\0"), ONE.reading(64, 1)
-    owed.miss(read, 1)
-    owed.write(write, 2)
-    owed.miss(read, 3)
-    assert owed.confuses(read, 4)
-
-
-def test_write_to_all_servos_invalidates_older_readings():
-    owed, read = Owed(), ONE.reading(64, 1)
-    owed.miss(read, 1)
-    owed.write(ONE.line.unanswered(protocol2.sync_write(64, 1, {ONE.servo.servo_id: b"\0"})), 2)
-    assert owed.confuses(read, 3)
-
-
-@pytest.mark.parametrize(("between", "confuses"), [(None, False), (ONE.writing(64, b"\1"), True)])
-def test_late_acknowledgement_counts_for_the_repetition_of_its_write(between, confuses):
-    owed, write = Owed(), ONE.writing(64, b"\0")
-    owed.write(write, 1)
-    owed.miss(write, 1)
-    if between is not None:
-        owed.write(between, 2)
-    owed.write(write, 3)
-    assert owed.confuses(write, 4) is confuses
-
-
-def test_slow_reply_widens_the_window_for_a_minute():
-    owed, read = Owed(), ONE.reading(64, 1)
-    owed.miss(read, 0)
-    owed.at_ns = slow_ns = 700 * MILLISECOND_NS
-    owed.replies.charge_reply(11, 1, 0)
-    assert owed.replies.window_ns == slow_ns * 5 // 4
-    owed.at_ns += SLOW_MEMORY_NS
-    assert owed.replies.window_ns == slow_ns * 5 // 4
-    owed.at_ns += 1
-    assert owed.replies.window_ns == LEAST_WINDOW_NS
+def test_slow_reply_widens_the_window_for_a_minute(owed, clock):
+    owed.add(READ_TORQUE, 0, 0)
+    clock.now_ns = slow_ns = 700 * MILLISECOND_NS
+    owed.charge_reply(11, 1, 0)
+    assert owed.window_ns == slow_ns * 5 // 4
+    clock.now_ns += SLOW_MEMORY_NS
+    assert owed.window_ns == slow_ns * 5 // 4
+    clock.now_ns += 1
+    assert owed.window_ns == LEAST_WINDOW_NS
 
 
 @pytest.mark.parametrize("register", [64, 65])
@@ -452,17 +437,7 @@ def scan_line(protocol: float, faults: Faults) -> tuple[set[str], int]:
 def set_up(protocol: float, faults: Faults) -> tuple[set[str], int]:
     """Give a servo what a robot file has for it, and read it back, as `dxlrun setup` does."""
     line, tool = tool_of(protocol)
-    table = find_table(MODELS[protocol], protocol)
-    wiring = Wiring("elbow", 0, 1, table, math.pi, 1, -1.5, 1.5)
-    plan = bus_plan(
-        name="main",
-        port=line.name,
-        baud_rate=1_000_000,
-        latency_ns=1_000_000,
-        return_delay_ns=0,
-        joints=[wiring],
-        protocol=protocol,
-    )
+    plan = plan_of(protocol, latency_ns=1_000_000)
     (found,) = find_servo(tool, 1, Search((protocol,), (1_000_000,)))
     replies = disturb_replies(line.bus, 1, faults)
     said: list[str] = []

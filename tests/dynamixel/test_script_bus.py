@@ -328,6 +328,8 @@ def test_set_of_servos_is_a_mapping_of_ids_and_takes_numbers_of_numpy(script):
     servos.write("led", np.array(0))
     with pytest.raises(ValueError, match="led is named twice"):
         servos.reader("led", "led")
+    with pytest.raises(LookupError, match=r"no servo with ID 'led' here; there are \[1, 2, 3\]"):
+        servos["led"]
 
 
 def test_states_belong_to_the_caller(script):
@@ -383,19 +385,6 @@ def test_first_reply_never_came():
     assert np.isnan([state.position[0], state.age[0]]).all()
     with pytest.raises(AttributeError, match="no item 'load'"):
         state.load  # noqa: B018  the access is what raises
-
-
-def test_line_that_is_gone_raises_and_so_does_a_closed_bus(script):
-    with script.bus as bus:
-        servos = bus.scan()
-        read, write = servos.reader("present_position"), servos.writer("goal_position")
-        read()
-        script.simulated.unplug()
-        for call in (lambda: servos.read("led"), read, lambda: write(1.0)):
-            with pytest.raises(PortError, match="is unplugged"):
-                call()
-    with pytest.raises(PortError, match="line is closed"):
-        read()
 
 
 def test_torque_stays_unless_the_bus_is_told(script):
@@ -573,11 +562,6 @@ def test_servos_without_ids_and_models_are_refused_before_a_byte_is_sent(script,
     assert script.sent() == []
 
 
-def test_servo_of_a_set_is_selected_by_its_id(script):
-    with pytest.raises(LookupError, match=r"no servo with ID 'led' here; there are \[1, 2, 3\]"):
-        script.bus.scan()["led"]
-
-
 @pytest.mark.parametrize(
     ("servos", "protocol"), [(("XM430-W350:1-2", "XL430-W250:3"), 2.0), (("AX-12A:1-3",), 1.0)]
 )
@@ -702,8 +686,9 @@ def test_a_lost_line_is_opened_again_with_its_readers_and_writers(script):
     script.let_pass(1)
     assert read().position == pytest.approx(start + 0.1, abs=0.02)
     script.bus.close()
-    with pytest.raises(PortError, match="is closed"):
-        script.bus.reopen()
+    for call in (read, script.bus.reopen):
+        with pytest.raises(PortError, match="is closed"):
+            call()
 
 
 @pytest.mark.parametrize("compiled", [True, False])

@@ -465,16 +465,10 @@ def simulation(memory: int) -> LineProgress:
     return SimulationProgress(memory).line(1)
 
 
-def publish_received(line: LineProgress, off_wire_ns: int) -> None:
-    line.words[0] = off_wire_ns
-
-
-def publish_served(line: LineProgress, until_ns: int) -> None:
-    line.words[1] = until_ns
-
-
-def publish_delivery(line: LineProgress, due_ns: int, now_ns: int) -> None:
-    line.words[3], line.words[2] = due_ns, now_ns
+def publish(line: LineProgress, **words: int) -> None:
+    """Publish when the simulation `received`, `served` and `delivered` bytes, and when those were `due`."""
+    for name, at_ns in words.items():
+        line.words[("received", "served", "delivered", "due").index(name)] = at_ns
 
 
 @pytest.fixture
@@ -494,17 +488,34 @@ def extended(port: SerialPort, now: int, heard: int = 0) -> int:
     return port.extend_deadline(DEADLINE, SENT, heard, now)
 
 
-def test_request_that_was_not_taken_is_awaited(port, simulation):
-    publish_received(simulation, SENT - 1)
-    publish_served(simulation, ENDLESS_NS)
-    assert extended(port, DEADLINE) == DEADLINE + MS
+DELIVERED = {"due": SENT + MS, "delivered": SENT + 11 * MS}
+
+
+@pytest.mark.parametrize(
+    ("words", "heard", "awaited"),
+    [
+        ({"received": SENT - 1}, 0, True),  # the request was not taken
+        ({"received": SENT + MS // 10}, 0, False),  # a servo that is silent
+        # a latency timer of 16 ms: the process sleeps until the reply is due, behind the deadline
+        ({"received": SENT, "served": SENT + 16 * MS}, 0, False),
+        # the reply was due, and the process has not run since
+        ({"received": SENT, "served": SENT + MS}, 0, True),
+        # the kernel still has the bytes, or the host has read since
+        ({"received": SENT, **DELIVERED}, SENT - MS, True),
+        ({"received": SENT, **DELIVERED}, SENT + 11 * MS, False),
+    ],
+)
+def test_reply_is_awaited_that_the_process_has_not_handed_over(port, simulation, words, heard, awaited):
+    publish(simulation, **{"served": ENDLESS_NS} | words)
+    assert (extended(port, DEADLINE, heard) > DEADLINE) is awaited
+    assert (port._stalls.times > 0) is awaited
 
 
 def test_deadline_counts_from_when_the_request_was_taken(port, simulation):
-    publish_served(simulation, SENT + 100 * MS)
-    publish_received(simulation, SENT + 100 * MS)
+    publish(simulation, served=SENT + 100 * MS)
+    publish(simulation, received=SENT + 100 * MS)
     assert extended(port, SENT + 101 * MS) > SENT + 101 * MS
-    publish_served(simulation, ENDLESS_NS)  # nothing is due any more: the servo is silent on purpose
+    publish(simulation, served=ENDLESS_NS)  # nothing is due any more: the servo is silent on purpose
     assert extended(port, SENT + 102 * MS) <= SENT + 102 * MS
 
 
@@ -513,39 +524,11 @@ def test_each_simulated_bus_has_its_own_progress(memory, simulation, stalls):
     buses: Any = [SimpleNamespace(port=SIMULATED)] * 2
     lines: Any = SimpleNamespace(simulation=memory)
     first, second = make_ports(buses, (ours, theirs), lines, stalls)
-    publish_served(simulation, ENDLESS_NS)
-    publish_received(simulation, SENT + MS // 10)
+    publish(simulation, served=ENDLESS_NS)
+    publish(simulation, received=SENT + MS // 10)
     assert extended(second, DEADLINE) <= DEADLINE < extended(first, DEADLINE)
     os.close(ours)
     os.close(theirs)
-
-
-def test_silent_servo_of_a_running_process_is_given_up_at_once(port, simulation, stalls):
-    publish_served(simulation, ENDLESS_NS)
-    publish_received(simulation, SENT + MS // 10)
-    assert extended(port, DEADLINE) <= DEADLINE
-    assert (stalls.times, stalls.waited_ns) == (0, 0)
-
-
-def test_reply_that_is_late_on_purpose_is_given_up_at_once(port, simulation):
-    """A latency timer of 16 ms: the process sleeps until the reply is due, which is behind the deadline."""
-    publish_served(simulation, SENT + 16 * MS)
-    publish_received(simulation, SENT)
-    assert extended(port, DEADLINE) <= DEADLINE
-
-
-def test_reply_that_was_due_and_was_not_handed_over_is_awaited(port, simulation):
-    publish_served(simulation, SENT + MS)  # when the reply is due; the process has not run since
-    publish_received(simulation, SENT)
-    assert extended(port, DEADLINE) > DEADLINE
-
-
-def test_bytes_that_the_kernel_still_has_are_awaited(port, simulation):
-    publish_received(simulation, SENT)
-    publish_delivery(simulation, SENT + MS, SENT + 11 * MS)
-    publish_served(simulation, ENDLESS_NS)
-    assert extended(port, DEADLINE, heard=SENT - MS) > DEADLINE
-    assert extended(port, DEADLINE, heard=SENT + 11 * MS) <= DEADLINE
 
 
 def test_wait_is_bounded_and_not_repeated_for_the_same_stall(port, simulation):
@@ -554,7 +537,7 @@ def test_wait_is_bounded_and_not_repeated_for_the_same_stall(port, simulation):
     assert extended(port, late) <= late
     later, sent = late + 100 * MS, late + 80 * MS
     assert port.extend_deadline(sent + 12 * MS, sent, 0, later) <= later
-    publish_received(simulation, late)  # the process runs again
+    publish(simulation, received=late)  # the process runs again
     assert port.extend_deadline(sent + 12 * MS, sent, 0, later) > later
 
 
@@ -576,8 +559,8 @@ def test_real_port_never_extends_a_deadline(port):
 
 
 def test_late_reply_is_split_into_what_its_process_was_late(port, simulation):
-    publish_received(simulation, SENT + 5 * MS)
-    publish_delivery(simulation, SENT + 6 * MS, SENT + 9 * MS)
+    publish(simulation, received=SENT + 5 * MS)
+    publish(simulation, due=SENT + 6 * MS, delivered=SENT + 9 * MS)
     assert port.late_ns(SENT, SENT + 10 * MS) == (5 + 4) * MS
 
 
@@ -591,5 +574,5 @@ def test_stalls_count_as_far_as_they_overlap(memory, port):
 
 
 def test_port_of_a_line_that_is_back_keeps_its_progress(port, simulation):
-    publish_received(simulation, SENT - 1)
+    publish(simulation, received=SENT - 1)
     assert extended(port.renewed(), DEADLINE) > DEADLINE
