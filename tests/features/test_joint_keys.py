@@ -8,8 +8,10 @@ from unittest.mock import Mock, call
 import numpy as np
 import pytest
 from msgspec import structs
+from tests.kit.cases import case_parameters, read_head
 from tests.kit.kept_events import Events
-from tests.kit.robots import compile_text, problems_in
+from tests.kit.robot_cases import check_case
+from tests.kit.robots import compile_text
 from tests.kit.stories import replayed
 
 from dxlrun.channels.cycle import Commands, States
@@ -26,15 +28,13 @@ from dxlrun.testing import installed, simulated_robot
 
 PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "add-a-section.md"
 ROBOTS = Path(__file__).parents[2] / "robots"
-HEAD = """name: knees
-buses:
-  main: {port: sim, protocol: 1.0, baud_rate: 1_000_000, adapter: {latency: 1 ms}, return_delay_time: 500 us}
-loop: {rate: 50}
+CASES = Path(__file__).parent / "cases" / "backlash.txt"
+ROBOT = read_head(CASES)
+SLIDE = """\
+  slide:
+    {bus: main, id: 3, model: AX-12A, reference: 150 deg, direction: 1, travel_per_turn: 94 mm,
+     backlash: 0.1 mm}
 """
-KNEE = "{bus: main, id: 1, model: AX-12A, reference: 150 deg, direction: 1, backlash: 4 deg}"
-ANKLE = "{bus: main, id: 2, model: AX-12A, reference: 150 deg, direction: 1}"
-SLIDE = "{bus: main, id: 3, model: AX-12A, reference: 150 deg, direction: 1, travel_per_turn: 94 mm%s}"
-ROBOT = f"{HEAD}joints:\n  knee: {KNEE}\n  ankle: {ANKLE}\n"
 STRICT = "Annotated[tuple[Position, Position], Field(strict=False)]"
 RAD_PER_TICK = np.radians(300) / 1023
 
@@ -56,34 +56,15 @@ def mechanics_with_backlash() -> str:
     return re.sub(r"(wrist_roll: *\{)", r"\1backlash: 1 deg, ", text)
 
 
-def said(text: str) -> str:
-    return "".join(map(str, problems_in(text)))
-
-
-def test_value_is_in_the_plan_of_its_joint_only():
-    plan = compile_text(ROBOT).plan
-    assert [dict(joint.keys) for joint in plan.loop.joints] == [{"backlash": np.radians(4)}, {}]
-    assert from_json(to_json(plan)) == plan
-    assert plan.packages["dxlrun_backlash"] == "dxlrun-backlash"
-
-
-def test_groups_and_defaults_give_the_key_to_joints():
-    defaults = f"{ROBOT}joint_defaults: {{backlash: 1 deg}}\n"
-    assert [joint.keys["backlash"] for joint in compile_text(defaults).plan.loop.joints] == [
-        pytest.approx(np.radians(4)),
-        pytest.approx(np.radians(1)),
-    ]
-    alone = compile_text(defaults.replace("backlash: 4 deg", "torque: on")).plan
-    assert alone.packages["dxlrun_backlash"] == "dxlrun-backlash"
-    groups = f"{ROBOT}groups: {{leg: {{joints: [ankle], backlash: 2 deg}}}}\n"
-    plan = compile_text(groups.replace("backlash: 4 deg", "torque: on")).plan
-    assert plan.loop.joints[1].keys["backlash"] == pytest.approx(np.radians(2))
-    assert plan.packages["dxlrun_backlash"] == "dxlrun-backlash"
+@pytest.mark.parametrize("case", case_parameters(CASES))
+def test_robot_file(case):
+    check_case(case)
 
 
 def test_joint_of_a_transmission_may_have_the_key():
-    joints = compile_text(mechanics_with_backlash()).plan.loop.joints
-    assert [joint.name for joint in joints if joint.keys] == ["wrist_roll"]
+    plan = compile_text(mechanics_with_backlash()).plan
+    assert [joint.name for joint in plan.loop.joints if joint.keys] == ["wrist_roll"]
+    assert from_json(to_json(plan)) == plan
 
 
 def test_key_with_a_name_like_a_key_of_servos_makes_no_joint_with_a_servo(monkeypatch):
@@ -122,24 +103,8 @@ def test_layer_forwards_every_call_that_it_does_not_change():
     assert public == {"servo_limits", *(name for name, *_ in calls)}
 
 
-def test_check_of_the_feature_names_the_place():
-    found = said(ROBOT.replace("4 deg", "400 deg"))
-    assert found.endswith("robot.yaml:6:87: the backlash of knee is outside its range; write less")
-
-
-def test_unit_of_the_other_kind_of_joint_is_refused():
-    slide = f"{ROBOT}  slide: {SLIDE % ', backlash: 1 deg'}\n"
-    assert "slide is linear, so its backlash cannot be in rad; write it as 0.2 mm" in said(slide)
-    assert "so its backlash cannot be in m; write it as 0.5 deg" in said(ROBOT.replace("4 deg", "4 mm"))
-
-
-def test_unknown_word_is_compared_with_the_key():
-    assert "did you mean backlash?" in said(ROBOT.replace("backlash", "baklash"))
-
-
 def test_check_shows_the_key_as_a_column():
-    slide = f"{ROBOT}  slide: {SLIDE % ', backlash: 0.1 mm'}\n"
-    found = compile_text(slide)
+    found = compile_text(ROBOT + SLIDE)
     assert [row["backlash"] for row in found.report["joints"]] == [np.radians(4), None, 1e-4]
     table = next(iter(check._tables(found)))
     column = [one.name for one in table.columns].index("backlash")

@@ -6,9 +6,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from tests.kit.cases import case_parameters, read_head
+from tests.kit.robot_cases import check_case
 from tests.kit.robots import compile_text
 
-from dxlrun import InputError
 from dxlrun.description.json_schema import robot_schema
 from dxlrun.features import feature
 from dxlrun.testing import installed, simulated_robot
@@ -44,26 +45,8 @@ def glow(file, servo, table):
 
 STAGE = SettingsStage(glow)
 """
-ROBOT = """name: lamps
-buses:
-  main: {port: sim, protocol: 2.0, baud_rate: 1_000_000, adapter: {latency: 1 ms}, return_delay_time: 500 us}
-loop: {rate: 50}
-policies: {on_returned_servo: hold}
-joint_defaults: {bus: main, model: XL430-W250, reference: 180 deg, direction: 1}
-joints:
-  bright: {id: 1, glow: true, registers: {position_p_gain: 700}}
-  dark: {id: 2}
-  both: {servos: [{id: 3}, {id: 4, glow: false}], glow: true}
-  roll: {}
-  pitch: {}
-transmissions:
-  wrist:
-    type: differential
-    joints: [roll, pitch]
-    servos:
-      left: {bus: main, id: 5, model: XL430-W250, reference: 180 deg, direction: 1, glow: true}
-      right: {bus: main, id: 6, model: XL430-W250, reference: 180 deg, direction: -1}
-"""
+CASES = Path(__file__).parent / "cases" / "glow.txt"
+ROBOT = read_head(CASES)
 GLOWING = {1, 3, 5}
 
 
@@ -73,17 +56,9 @@ def with_glow(project: Callable[..., Path]) -> Iterator[None]:
         yield
 
 
-def test_each_servo_has_the_value_of_its_own_or_of_its_joint():
-    plan = compile_text(ROBOT).plan
-    assert {servo.servo_id for servo in plan.buses[0].servos if "led" in servo.declared} == GLOWING
-    assert plan.buses[0].servos[0].declared == {"position_p_gain": 700, "led": 1}
-    assert plan.packages["dxlrun_glow"] == "dxlrun-glow"
-
-
-def test_key_of_a_later_feature_counts():
-    text = ROBOT.replace("registers: {position_p_gain: 700}", "registers: {led: 0}")
-    settings = compile_text(text).plan.buses[0].servos[0].settings
-    assert [(one.name, one.value) for one in settings] == [("led", 1)]
+@pytest.mark.parametrize("case", case_parameters(CASES))
+def test_robot_file(case):
+    check_case(case)
 
 
 def test_robot_without_the_key_does_not_use_the_package():
@@ -91,20 +66,6 @@ def test_robot_without_the_key_does_not_use_the_package():
     feature._stage.cache_clear()
     assert "dxlrun_glow" not in compile_text(re.sub(", glow: (true|false)", "", ROBOT)).plan.packages
     assert "dxlrun_glow.settings" not in sys.modules
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "said"),
-    [
-        ("glow: false", "glow: maybe", r"yaml:10:42: joints.both.servos\[1\].glow is the text 'maybe'"),
-        ("id: 2}", "id: 2, model: PH42-020-S300-R, glow: true}", "cannot glow"),
-        ("roll: {}", "roll: {glow: true}", "roll"),
-    ],
-)
-def test_mistake_is_named_at_its_place(old, new, said):
-    assert old in ROBOT
-    with pytest.raises(InputError, match=said):
-        compile_text(ROBOT.replace(old, new))
 
 
 def test_every_form_of_a_servo_is_in_the_schema():
