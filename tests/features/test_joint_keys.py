@@ -12,7 +12,7 @@ from tests.kit.cases import case_parameters, read_head
 from tests.kit.kept_events import Events
 from tests.kit.robot_cases import check_case
 from tests.kit.robots import compile_text
-from tests.kit.stories import replayed
+from tests.kit.told_stories import check_story, story_parameters
 
 from dxlrun.channels.cycle import Commands, States
 from dxlrun.cli import check
@@ -24,11 +24,12 @@ from dxlrun.dynamixel.hardware_layer import HardwareLayer, HardwareLayers
 from dxlrun.features.mechanics.joint_hardware import JointHardware
 from dxlrun.plan.loop_plan import JointValues
 from dxlrun.plan.robot_plan import from_json, to_json
-from dxlrun.testing import installed, simulated_robot
+from dxlrun.testing import installed
 
 PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "add-a-section.md"
 ROBOTS = Path(__file__).parents[2] / "robots"
-CASES = Path(__file__).parent / "cases" / "backlash.txt"
+HERE = Path(__file__).parent
+CASES = HERE / "cases" / "backlash.txt"
 ROBOT = read_head(CASES)
 SLIDE = """\
   slide:
@@ -36,7 +37,6 @@ SLIDE = """\
      backlash: 0.1 mm}
 """
 STRICT = "Annotated[tuple[Position, Position], Field(strict=False)]"
-RAD_PER_TICK = np.radians(300) / 1023
 
 
 @pytest.fixture(autouse=True)
@@ -59,6 +59,11 @@ def mechanics_with_backlash() -> str:
 @pytest.mark.parametrize("case", case_parameters(CASES))
 def test_robot_file(case):
     check_case(case)
+
+
+@pytest.mark.parametrize("case", [*story_parameters(HERE / "stories" / "backlash.txt")])
+def test_story(case, tmp_path):
+    check_story(case, tmp_path)
 
 
 def test_joint_of_a_transmission_may_have_the_key():
@@ -151,31 +156,3 @@ def test_key_is_in_the_schema():
     assert names[names.index("simulation") - 1] == "backlash"
     assert "backlash" in schema["properties"]["joint_defaults"]["properties"]
     assert "Play of the gear" in schema["$defs"]["BareJoint"]["properties"]["backlash"]["description"]
-
-
-def test_goals_go_on_by_half_of_the_play(tmp_path):
-    text = f"{ROBOT}controllers:\n  legs: {{type: joint_group_position_controller, joints: [knee, ankle]}}\n"
-    (tmp_path / "robot.yaml").write_text(text)
-    motion = tmp_path / "motion.yaml"
-    motion.write_text(
-        "name: steps\nmotions:\n  - controller: legs\n    start: 0 s\n    points:\n"
-        "      - {time: 0.1 s, joints: {knee: {position: 10 deg}, ankle: {position: 10 deg}}}\n"
-        "      - {time: 1.0 s, joints: {knee: {position: 5 deg}, ankle: {position: 5 deg}}}\n"
-    )
-    log = tmp_path / "run.mcap"
-    robot = simulated_robot(tmp_path / "robot.yaml", play=[motion], duration_s=2.0, log=log)
-    goals: list[list[float]] = []
-    for at_s in (0.9, 1.9):
-        robot.buses[0].at(
-            round(at_s * 1e9),
-            lambda: goals.append(
-                [
-                    robot.buses[0].servo(each).registers["goal_position"] * RAD_PER_TICK - np.radians(150)
-                    for each in (1, 2)
-                ]
-            ),
-        )
-    robot.run()
-    expected = [[np.radians(12), np.radians(10)], [np.radians(3), np.radians(5)]]
-    np.testing.assert_allclose(goals, expected, atol=RAD_PER_TICK)
-    assert replayed(log).cycles["goal_position"][-1] == pytest.approx(np.radians(5)), "the log has the joints"

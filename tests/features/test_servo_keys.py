@@ -9,11 +9,11 @@ import pytest
 from tests.kit.cases import case_parameters, read_head
 from tests.kit.robot_cases import check_case
 from tests.kit.robots import compile_text
+from tests.kit.told_stories import check_story, story_parameters
 
 from dxlrun.description.json_schema import robot_schema
 from dxlrun.features import feature
-from dxlrun.testing import installed, simulated_robot
-from dxlsim.servo.protocol2_servo import Protocol2Servo
+from dxlrun.testing import installed
 
 SERVO_KEY = """
 from dxlrun.tooling.features import ServoKey
@@ -45,9 +45,9 @@ def glow(file, servo, table):
 
 STAGE = SettingsStage(glow)
 """
-CASES = Path(__file__).parent / "cases" / "glow.txt"
+HERE = Path(__file__).parent
+CASES = HERE / "cases" / "glow.txt"
 ROBOT = read_head(CASES)
-GLOWING = {1, 3, 5}
 
 
 @pytest.fixture(autouse=True)
@@ -61,6 +61,11 @@ def test_robot_file(case):
     check_case(case)
 
 
+@pytest.mark.parametrize("case", [*story_parameters(HERE / "stories" / "glow.txt")])
+def test_story(case, tmp_path):
+    check_story(case, tmp_path)
+
+
 def test_robot_without_the_key_does_not_use_the_package():
     sys.modules.pop("dxlrun_glow.settings", None)
     feature._stage.cache_clear()
@@ -72,21 +77,3 @@ def test_every_form_of_a_servo_is_in_the_schema():
     forms = robot_schema({}, {})["$defs"]
     having = {name for name, form in forms.items() if "glow" in form.get("properties", {})}
     assert having == {"Joint", "SharedJoint", "OneOfServos", "TransmissionServo", "Group"}
-
-
-def test_start_and_return_write_the_setting(tmp_path):
-    (tmp_path / "robot.yaml").write_text(ROBOT)
-    robot = simulated_robot(tmp_path / "robot.yaml", duration_s=3.0)
-    servos, leds = robot.buses[0].servos, list[set[int]]()
-
-    def look() -> None:
-        leds.append({servo.servo_id for servo in servos if servo.registers["led"]})
-
-    robot.buses[0].at(500_000_000, look)
-    first = robot.buses[0].servo(1)
-    assert isinstance(first, Protocol2Servo)
-    robot.buses[0].at(600_000_000, first.reboot)
-    robot.buses[0].at(610_000_000, look)
-    robot.buses[0].at(2_800_000_000, look)
-    robot.run()
-    assert leds == [GLOWING, GLOWING - {1}, GLOWING]

@@ -1,4 +1,4 @@
-"""Each robot file with each of its motions: it compiles, it runs, it is where the motion wants it."""
+"""Each robot file with each of its motions: it compiles, runs, and is replayed without a difference."""
 
 from pathlib import Path
 
@@ -8,6 +8,7 @@ from tests.kit.clients import command_of, played
 from tests.kit.examples import as_parameters
 
 from dxlrun.compile.robot_compiler import compile_files
+from dxlrun_analysis.replay import replay_log
 from dxlwire.joint_unit import LINEAR
 
 pytestmark = pytest.mark.long
@@ -44,6 +45,7 @@ def test_every_motion_runs_by_the_command_that_it_names(path, tmp_path):
     run = played(tmp_path, command, min(LONGEST_S, plan.loop.end_ns * 1e-9))
 
     result, cycles = run.robot.result, run.log.cycles
+    assert replay_log(run.log.path).same
     assert (result.reason, result.detail, result.skipped, run.robot.failures) == ("ended", "", 0, ())
     assert cycles["valid"].all()
     ends = {command.controller: command for command in plan.loop.commands}

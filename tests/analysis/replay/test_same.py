@@ -1,11 +1,7 @@
 """A replay of what was not changed has no difference, whatever happened in the run; `dxlrun replay`."""
 
-import os
 import random
 import re
-import subprocess
-import sys
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,17 +9,15 @@ import numpy as np
 import pytest
 from msgspec import structs
 from tests.kit.answers import result_of
-from tests.kit.campaigns import campaign
 from tests.kit.changed_logs import command, edited, no_commands, put, versions
 from tests.kit.commands import cases, play
-from tests.kit.examples import as_parameters
 from tests.kit.pages import page_text
-from tests.kit.stories import differing, replayed, silence
+from tests.kit.stories import differing, silence
 from tests.kit.totals import totals_of
 
 from dxlrun.compile.robot_compiler import compile_files
-from dxlrun.errors import InputError, LogError
-from dxlrun.testing import VirtualRobot, plan_of, read_log, simulated_robot
+from dxlrun.errors import LogError
+from dxlrun.testing import VirtualRobot, read_log
 from dxlrun_analysis.replay import recorded_inputs, replay_log
 from dxlrun_analysis.replay.recorded_inputs import recorded
 from dxlrun_analysis.report import analyze, facts
@@ -33,32 +27,6 @@ pytestmark = pytest.mark.long
 
 
 ROBOTS = Path(__file__).parents[3] / "robots"
-DXLRUN = Path(sys.executable).with_name("dxlrun")
-
-
-def motions_for(robot: Path) -> list[Path]:
-    """Return the motion that fits a robot, if there is one; the robot file names its controllers."""
-    text = robot.read_text()
-    for motion in sorted((ROBOTS / "motions").glob("*.yaml")):
-        names = re.findall(r"controller: (\w+)", motion.read_text())
-        if "include:" not in text and not all(f"{name}:" in text for name in names):
-            continue
-        with suppress(InputError):
-            compile_files(robot, {}, [motion])
-            return [motion]
-    return []
-
-
-@campaign(ci=4, night=15, release=60)
-@pytest.mark.parametrize("robot", as_parameters(sorted(ROBOTS.glob("*.yaml"))))
-def test_replay_of_each_robot_has_no_difference(robot, tmp_path, amount):
-    """`amount` is the length in seconds, or as many cycles as a robot of 100 Hz has in them."""
-    log = tmp_path / "run.mcap"
-    seconds = min(amount, 100 * amount * plan_of(robot).loop.period_ns * 1e-9)
-    simulated_robot(robot, play=motions_for(robot), duration_s=seconds, log=log).run()
-    read = replayed(log)
-    periods = len(read.cycles) + read.cycles["skipped"].sum()
-    assert periods == round(seconds * 1e9 / read.period_ns)
 
 
 def test_small_robot_shows_every_kind_of_value(pair_log):
@@ -88,25 +56,6 @@ def test_commands_from_outside_come_from_the_log(pair_log, changed):
     other_data = command("trajectory", data=(np.frombuffer(planned.data) * 1.01).tobytes())
     _, first = differing(changed(pair_log, by_value, other_data))
     assert first.joint == "pan"
-
-
-def test_run_in_real_time(tmp_path, robot_file, plugin):
-    environment = os.environ | {"PYTHONPATH": f"{plugin}:{os.environ.get('PYTHONPATH', '')}"}
-
-    def dxlrun(*words: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            [DXLRUN, *words], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
-        )
-
-    motion = robot_file.with_name("look.yaml")
-    ran = dxlrun(str(robot_file), "--play", str(motion), "--duration", "1.5", "--no-gateway")
-    logs = list((tmp_path / "logs").glob("*.mcap"))  # how the run went is not judged: machines are busy
-    assert len(logs) == 1, ran.stdout + ran.stderr
-    cycles = read_log(logs[0]).cycles
-    assert len(cycles) > 0, ran.stderr
-    told = dxlrun("replay", str(logs[0]))
-    assert told.returncode == 0, told.stdout + told.stderr
-    assert told.stdout == f"pair: {len(cycles)} cycles replayed, 0 differences\n"
 
 
 PERIOD_NS = 3_125_000
