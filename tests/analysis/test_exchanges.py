@@ -22,14 +22,14 @@ from dxlrun_analysis.servos.logged_requests import heads
 from dxlrun_analysis.servos.losses import ServoLosses, narrowest
 from dxlrun_analysis.servos.other_host import OtherHosts
 from dxlwire.packets import PacketKind
+from dxlwire.wire import protocol2
 
 ASK, STATUS, NOISE, LATE = PacketKind.INSTRUCTION, PacketKind.STATUS, PacketKind.NOISE, PacketKind.LATE
 Write = Callable[..., Path]
 BUS = LoggedBus("main", protocol=2.0, baud_rate=1_000_000)
 SYNC_READ = bytes.fromhex("fffffd00fe0a0082840004000307040000")  # servos 3, 7 and 4
 FAST_READ = bytes.fromhex("fffffd00fe0a008a840004000307040000")
-PING_7, PING_9 = (bytes((0xFF, 0xFF, 0xFD, 0, one, 3, 0, 1, 0, 0)) for one in (7, 9))
-PING_ALL = bytes.fromhex("fffffd00fe0300013142")
+PING_7, PING_9, PING_ALL = map(protocol2.ping, (7, 9, 254))
 HEAD = b"\xff\xff\xfd\x00\xfe\x1a\x00\x55"  # of a fast status packet
 CUT = HEAD + bytes((0, 3, 1, 2, 3, 4, 5, 6))
 """A fast status packet without the blocks of 7 and 4."""
@@ -347,11 +347,7 @@ def test_own_instructions_that_come_back_are_an_echo_and_no_other_host(write, he
 IDS = (1, 2, 3, 4)
 SERVOS = [{"joint": f"j{servo}", "servo_id": servo, "row": servo} for servo in IDS]
 CHAINED = {"buses": [{"name": "main", "protocol": 2.0, "baud_rate": 1_000_000, "servos": SERVOS}]}
-CHAIN = bytes.fromhex("fffffd00fe0b0082840004000102030400 00".replace(" ", ""))
-
-
-def read_alone(servo: int) -> bytes:
-    return bytes((0xFF, 0xFF, 0xFD, 0, servo, 7, 0, 2, 132, 0, 4, 0, 0, 0))
+CHAIN = protocol2.sync_read(132, 4, IDS)
 
 
 Judge = Callable[..., dict[str, Finding]]
@@ -373,7 +369,7 @@ def found(write):
             for place, each in enumerate(() if silent(cycle) else IDS):
                 when = at + 330 + 150 * place + late_us(cycle, 0)
                 packets.append(Wire(STATUS, each, when, status(each)))
-            packets.append(Wire(ASK, servo, at + 9000, read_alone(servo)))
+            packets.append(Wire(ASK, servo, at + 9000, protocol2.read_range(servo, 132, 4)))
             if not lost(cycle, servo):
                 when = at + 9290 + late_us(cycle, servo)
                 packets.append(Wire(STATUS, servo, when, status(servo)))

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -16,12 +17,14 @@ from dxlrun_analysis.servos.joint_states import JointStates
 from dxlrun_analysis.servos.losses import Losses
 from dxlrun_analysis.servos.reply_times import ReplyTimes
 from dxlwire.packets import PacketKind
+from dxlwire.wire import protocol2
 
 IDS = (1, 2, 3)
 CYCLES = 300
 PERIOD = 10_000  # us, as all times here
 SIZE = 4
-CHAIN = bytes([255, 255, 253, 0, 254, 10, 0, 0x82, 132, 0, SIZE, 0, *IDS, 0, 0])
+CHAIN = protocol2.sync_read(132, SIZE, IDS)
+ask = partial(protocol2.read_range, address=132, length=SIZE)
 REPLY = 11 + SIZE
 DELAY = 100
 BUS = LoggedBus(
@@ -31,14 +34,6 @@ BUS = LoggedBus(
     return_delay_ns=DELAY * 1000,
     servos=tuple(LoggedServo(servo_id=servo, joint=f"j{servo}") for servo in IDS),
 )
-
-
-def ask(servo: int) -> bytes:
-    return bytes([255, 255, 253, 0, servo, 7, 0, 0x02, 132, 0, SIZE, 0, 0, 0])
-
-
-def status(servo: int) -> bytes:
-    return bytes([255, 255, 253, 0, servo, 8, 0, 0x55, 0, *bytes(SIZE), 0, 0])
 
 
 class Line:
@@ -59,7 +54,7 @@ class Line:
         self.now += len(data) * 10
         for servo, us in zip(servos, own, strict=True):
             self.now += round(us) + REPLY * 10
-            self.add(cycle, PacketKind.STATUS, servo, status(servo))
+            self.add(cycle, PacketKind.STATUS, servo, protocol2.status_packet(servo, 0, bytes(SIZE)))
 
 
 def findings(packets: Line, *, line: bool = False) -> list[Finding]:
@@ -101,10 +96,20 @@ def run(
             line.exchange(cycle, CHAIN, IDS, [first + waking + adapter, *behind])
         else:
             for servo in IDS:
-                line.exchange(cycle, ask(servo), [servo], [own(servo) + (waking if servo == IDS[0] else 0)])
+                line.exchange(
+                    cycle,
+                    ask(servo),
+                    [servo],
+                    [own(servo) + (waking if servo == IDS[0] else 0)],
+                )
         line.now += 2000  # the idle time
         servo = IDS[cycle % len(IDS)]
-        line.exchange(cycle, ask(servo), [servo], [own(servo) + adapter + (idle if servo == slow else 0.0)])
+        line.exchange(
+            cycle,
+            ask(servo),
+            [servo],
+            [own(servo) + adapter + (idle if servo == slow else 0.0)],
+        )
     return line
 
 

@@ -19,15 +19,7 @@ from dxlrun.features.sensors.plan import SensorPlan, encode_sensors
 from dxlrun.plan.loop_plan import JointPlan, LoopPlan, SourcePlan
 from dxlrun.testing import VirtualRobot, plan_of
 
-ROBOT = """\
-name: pair
-buses:
-  main: {port: sim, protocol: 1.0, baud_rate: 1_000_000, return_delay_time: 100 us, adapter: {latency: 1 ms}}
-loop: {rate: 50}
-joints:
-  pan: {bus: main, id: 3, model: AX-12A, reference: 150 deg, direction: 1}
-  tilt: {bus: main, id: 7, model: AX-12A, reference: 150 deg, direction: 1}
-"""
+ROBOT = Path(__file__).parents[2] / "robots" / "single_joint.yaml"
 
 
 class Broken:
@@ -63,10 +55,8 @@ class OneMonitor(Feature, frozen=True, kw_only=False):
 @pytest.mark.parametrize(
     ("monitor", "raised"), [(Broken, "ValueError: no such joint"), (Exiting, "SystemExit: 3")]
 )
-def test_monitor_that_raises_ends_the_run_by_on_fault(monitor, raised: str, tmp_path: Path) -> None:
-    file = tmp_path / "pair.yaml"
-    file.write_text(ROBOT)
-    plan = plan_of(file, duration_s=2.0)
+def test_monitor_that_raises_ends_the_run_by_on_fault(monitor, raised: str) -> None:
+    plan = plan_of(ROBOT, duration_s=2.0)
     features = (*plan.features, OneMonitor("broken", "", "tests 1", monitor))
     robot = VirtualRobot(replace(plan, loop=replace(plan.loop, features=features)))
     result = robot.run()

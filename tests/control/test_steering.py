@@ -79,6 +79,13 @@ def test_a_fallback_comes_after_all_whose_modes_came_in_its_cycle():
     assert robot.result.reason == "fault"
 
 
+def test_a_switch_that_waits_for_its_modes_is_refused_where_the_run_ends(robot):
+    robot.script("pushes", joints=("j0",), command=("effort",), active=False).build()
+    robot.hardware.mode_cycles = lambda: 30
+    robot.run(4, {2: robot.switches(["pushes"])})
+    assert robot.answer()[0] is Code.RUN_ENDING
+
+
 @pytest.mark.parametrize("limp", [["j0"], ["j0", "j1"]])
 def test_fallback_of_a_limp_joint_leaves_the_fault_to_the_next_fallback_or_to_the_policy(limp):
     robot = Robot(joints=3).script("lower", joints=("j2",), fallback="near", reference=("position",))

@@ -12,26 +12,21 @@ from dxlrun_analysis.causes.account import Account
 from dxlrun_analysis.plan_excerpt import LoggedBus
 from dxlrun_analysis.servos.exchanges import Pairing
 from dxlwire.packets import PacketKind
+from dxlwire.wire import protocol2
 
 PERIOD = 10_000  # us, as all times here
 IDS = (1, 2, 3)
 SIZE = 4
-ASK = bytes([255, 255, 253, 0, 254, 10, 0, 0x82, 132, 0, SIZE, 0, *IDS, 0, 0])  # A sync read of Protocol 2.0
+ASK = protocol2.sync_read(132, SIZE, IDS)
 REPLY = 11 + SIZE  # Bytes of its replies
 DELAY = 100
 STEP = DELAY + REPLY * 10  # From one reply to the next at 1 Mbit/s
 BUS = LoggedBus("main", protocol=2.0, baud_rate=1_000_000, return_delay_ns=DELAY * 1000, latency_ns=0)
-
-
 NAMES = ("scheduled", "woken", "read", "updated", "written", "period", "late")
 
 
 def asked(at: int, bus: int = 0) -> LoggedPacket:
     return LoggedPacket(bus, PacketKind.INSTRUCTION, 254, at * 1000, at * 1000, ASK)
-
-
-def status(servo: int) -> bytes:
-    return bytes([255, 255, 253, 0, servo, 8, 0, 0x55, 0, *bytes(SIZE), 0, 0])
 
 
 def replies(at: int, ends: Sequence[int], bus: int = 0) -> list[LoggedPacket]:
@@ -40,11 +35,12 @@ def replies(at: int, ends: Sequence[int], bus: int = 0) -> list[LoggedPacket]:
 
 
 def reply(servo: int, end: int, bus: int = 0) -> LoggedPacket:
-    return LoggedPacket(bus, PacketKind.STATUS, servo, end * 1000, end * 1000, status(servo))
+    data = protocol2.status_packet(servo, 0, bytes(SIZE))
+    return LoggedPacket(bus, PacketKind.STATUS, servo, end * 1000, end * 1000, data)
 
 
 def read_alone(servo: int, at: int, late: int) -> list[LoggedPacket]:
-    data = bytes([255, 255, 253, 0, servo, 7, 0, 2, 132, 0, SIZE, 0, 0, 0])
+    data = protocol2.read_range(servo, 132, SIZE)
     request = LoggedPacket(0, PacketKind.INSTRUCTION, servo, at * 1000, at * 1000, data)
     return [request, reply(servo, at + ALONE + late)]
 
