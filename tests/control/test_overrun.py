@@ -39,6 +39,11 @@ def test_the_robot_file_decides_where_no_plug_in_has_an_answer(robot, policy, cy
     assert policy != "catch_up" or robot.events.of(EventCode.OVERRUN) == [("loop", caught_up)]
 
 
+def test_five_late_cycles_at_most_follow_at_once(robot):
+    robot.run(work={1: 7.5}, end_ns=12 * PERIOD_NS, overrun="catch_up")
+    assert robot.column("cycle") == [0, 1, *range(4, 12)]
+
+
 def test_a_plug_in_decides_before_the_robot_file(robot):
     asked = []
     hook = OverrunHook("mine", lambda *times: asked.append(times) or "catch_up")

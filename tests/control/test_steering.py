@@ -184,6 +184,11 @@ def test_another_rate_begins_at_the_next_deadline_and_controllers_keep_theirs(le
     assert left.patience == [PERIOD_NS // 2]
 
 
+def test_a_stall_counts_as_five_periods_of_the_new_rate(left):
+    left.run(13, {2: left.asks("rate", rate=100.0)}, work={5: 4.0})
+    assert max(call.value for call in left.calls if call.step == "update") == 5 * PERIOD_NS // 2
+
+
 # Commands and streams
 
 

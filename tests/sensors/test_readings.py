@@ -283,15 +283,25 @@ def test_a_sensor_whose_noise_does_not_show_is_stuck_until_it_changes():
     assert [code for code, _ in desk.told()] == [SensorEvent.SENSOR_BACK]
 
 
-def test_a_sensor_is_not_stuck_while_one_noisy_value_changes_or_it_has_no_noise():
+STUCK: dict[str, tuple[list[tuple[float, float, float]], int]] = {
+    "one noisy value changes": ([(1.0, 0.1 * (turn % 2), 0.01) for turn in range(100)], 100),
+    "a chip with a dead band at rest": ([(0.1, 0.2, 0.01), (0.0, 0.0, 3.0)], 301),
+    "it measures each 250 ms": ([*((0.1 * turn, 2.0, 0.25) for turn in range(1, 9)), (0.9, 2.0, 1.2)], 300),
+    "it never changes": ([(1.0, 2.0, 2.2)], 200),
+}
+"""Samples and for how long, s; and how many of them are valid at least."""
+
+
+@pytest.mark.parametrize("case", STUCK)
+def test_a_sensor_is_stuck_only_after_more_equal_samples_than_before(case):
+    samples, fine = STUCK[case]
     desk = Desk(noisy=STATES)
-    for turn in range(100):
-        desk.sample(1.0, 0.1 * (turn % 2))
-        assert desk.cycle(10)[1:] == (True, 10 * MS)
-    assert all(valid for valid, _ in bring(Desk(), 1.0, 2.0, 3.0))
+    valid = [valid for one in samples for valid, _ in bring(desk, *one)]
+    assert all(valid[:fine])
+    assert valid[-1] is (len(valid) == fine)
 
 
-def test_few_equal_samples_of_a_slow_sensor_and_many_of_a_fast_poll_are_no_sign():
+def test_few_equal_samples_many_of_a_fast_poll_and_no_noise_are_no_sign():
     slow, polled = Desk(noisy=STATES), Desk(noisy=STATES)
     for _ in range(19):  # 380 ms
         slow.sample(1.0)
@@ -299,26 +309,7 @@ def test_few_equal_samples_of_a_slow_sensor_and_many_of_a_fast_poll_are_no_sign(
     for turn in range(400):  # a device at 10 Hz, asked every ms
         polled.sample(float(turn // 100))
         assert polled.cycle(1)[1]
-
-
-def test_a_chip_with_a_dead_band_is_not_stuck_at_rest():
-    desk = Desk(noisy=STATES)
-    bring(desk, 0.1, 0.2, 0.01)
-    assert all(valid for valid, _ in bring(desk, 0.0, 0.0, 3.0))
-
-
-def test_a_sensor_that_measures_each_250_ms_and_is_read_each_10_ms_is_not_stuck():
-    desk = Desk(noisy=STATES)
-    assert all(valid for turn in range(1, 9) for valid, _ in bring(desk, 0.1 * turn, 2.0, 0.25))
-    valid = [valid for valid, _ in bring(desk, 0.9, 2.0, 1.2)]
-    assert all(valid[:100])
-    assert not valid[-1]
-
-
-def test_a_sensor_that_never_changes_is_stuck_after_two_seconds():
-    valid = [valid for valid, _ in bring(Desk(noisy=STATES), 1.0, 2.0, 2.2)]
-    assert all(valid[:200])
-    assert not valid[-1]
+    assert all(valid for valid, _ in bring(Desk(), 1.0, 2.0, 3.0))
 
 
 @pytest.mark.parametrize("wrong", [math.nan, math.inf, -math.inf])
