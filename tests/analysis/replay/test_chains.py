@@ -1,17 +1,14 @@
 """A replay of chains has no difference, and names the reference that differs where there is one."""
 
 from collections.abc import Mapping
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from numpy.typing import NDArray
-from tests.kit.campaigns import campaign
 from tests.kit.changed_logs import flip, plan
-from tests.kit.stories import Asked, ask, differing, rate, replayed, send, silence, switch, tell, torque
+from tests.kit.stories import Asked, ask, differing, rate, replayed, send, switch, tell, torque
 
 from dxlrun.channels.event_records import EventCode
 from dxlrun.errors import InputError, LogError
@@ -117,6 +114,14 @@ STORIES: Mapping[str, Asked] = {
         30: [switch(["top"], ["spare", "top"])],
     },
     "a restart": {10: [switch(["top"], ["top", "middle"])]},
+    "goals of a chain": {
+        3: [send("top", "move", 0.2), send("beside", "move", -0.1, lease_ns=60_000_000)],
+        8: [ask("parameters", {"controller": "top", "values": {"gain": -0.2}}), rate(100)],
+        12: [ask("cancel", {"goal": 0, "controller": "top"}), torque(["tilt"], on=False)],
+        20: [ask("pause")],
+        25: [ask("resume"), torque(["tilt"], on=True), rate(50)],
+        30: [ask("halt")],
+    },
 }
 
 
@@ -187,44 +192,3 @@ def test_other_references_than_those_of_the_log_are_refused(story, changed):
     other = plan(lambda content: content["loop"]["controllers"][1].update(reference=["position"]))
     with pytest.raises(LogError, match="the log is damaged: plan and cycles differ in references"):
         replay_log(changed(story("a restart"), other))
-
-
-NAME, JOINTS = (
-    st.sampled_from(NAMES),
-    st.lists(st.sampled_from(("pan", "tilt", "nod")), min_size=1, unique=True),
-)
-SOME = st.lists(NAME, max_size=4, unique=True)
-COMMANDS = st.one_of(
-    st.builds(switch, SOME, SOME),
-    st.builds(switch, SOME.map(lambda names: names[:1])),
-    st.just(switch(["alone"], ["top", "middle", "beside", "base"])),
-    st.builds(lambda name: ask("cancel", {"goal": 0, "controller": name}), NAME),
-    st.builds(
-        lambda name, gain: ask("parameters", {"controller": name, "values": {"gain": gain}}),
-        *(NAME, st.floats(-0.5, 0.5)),
-    ),
-    st.builds(lambda joints, release: torque(joints, on=False, release=release), JOINTS, st.booleans()),
-    st.builds(lambda joints: torque(joints, on=True), JOINTS),
-    st.builds(
-        lambda joints, release: ask("reboot", {"joints": joints[:1], "release": release}),
-        *(JOINTS, st.booleans()),
-    ),
-    st.sampled_from((25.0, 50.0, 100.0)).map(rate),
-    st.sampled_from(("pause", "resume", "halt")).map(ask),
-    st.builds(
-        lambda name, angle, lease_ns: send(name, "move", angle, lease_ns=lease_ns),
-        *(NAME, st.floats(-0.3, 0.3), st.sampled_from((0, 60_000_000))),
-    ),
-)
-
-
-@campaign(ci=8, night=100, release=500)
-@settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(
-    st.dictionaries(st.integers(0, 45), st.lists(COMMANDS, min_size=1, max_size=4), max_size=12),
-    st.sampled_from(((), (3,), (7,), (8,))),
-)
-def test_random_runs_of_chains(tmp_path, asked, silent):
-    ended = {**asked, 60: [ask("resume")], 120: [ask("stop")]}  # a pause has no end
-    before = partial(silence, servos=silent, begin_ms=300, end_ms=700)
-    replayed(tell(write_robot(tmp_path), ended, tmp_path / "run.mcap", before=before))
