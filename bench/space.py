@@ -16,6 +16,7 @@ import random
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +30,7 @@ from dxlrun import RemoteRobot
 from dxlrun.testing import plan_of
 from dxlrun.tooling.runs import VirtualLink
 from dxlrun_space.cartesian_controller import MOST_STEPS, STEP_NS, CartesianController
-from dxlrun_space.path import MotionLimits, plan_line
+from dxlrun_space.path import MotionLimits, NoPath, plan_line
 
 ROBOT = Path(__file__).parents[1] / "robots/open_manipulator_x_space.yaml"
 EXAMPLES = ("open_manipulator_x", "koch", "op3", "six")
@@ -91,13 +92,16 @@ def lines_ms(arm: Arm, poses: int) -> list[float]:
     """Return how long lines to poses near the start are planned at 100 Hz, ms, with those that end early."""
     chance, dice, taken = random.Random(3), np.random.default_rng(3), []
     count, steps = len(arm.joints), min(MOST_STEPS, 10_000_000 // STEP_NS)
-    limits = MotionLimits((4.0,) * count, (20.0,) * count, 0.2, 0.5, 1.5, 6.0)
+    limits = MotionLimits((0.2, 1.5, *(4.0,) * count), (0.5, 6.0, *(20.0,) * count))
     for _ in range(poses):
         start, way = arm.drawn(chance, 0.6), dice.normal(size=3)
         goal = arm.matrix(start)
         goal[:3, 3] += 0.5 * chance.random() * arm.chain.length * way / np.linalg.norm(way)
-        planning = plan_line(arm.solver, start, as_pose(goal), limits, exact=arm.exact)
-        taken.append(sum(1 for _ in planning) / steps * 10)
+        planned = 0
+        with suppress(NoPath):
+            for _ in plan_line(arm.solver, start, as_pose(goal), limits, exact=arm.exact):
+                planned += 1
+        taken.append(planned / steps * 10)
     return taken
 
 

@@ -59,9 +59,10 @@ STEP_NS: Final = 300_000
 MOST_STEPS: Final = 50
 """Most steps of a cycle, 2.5 ms."""
 _LONGEST_STOP_S: Final = 2.0
+_MOVES: Final = "the arm moves; ask again when it rests"
 NO_TWIST: Final[Twist] = (BASE.translation, BASE.translation)
-Task: TypeAlias = "Generator[None, None, None]"
-"""Motion that advances by a cycle, or planning by a step, with each `next`."""
+Task: TypeAlias = "Generator[bool | None, None, None]"
+"""Motion or planning that advances with each `next`; True if the cycle has no time for another step."""
 
 
 class TranslationLimits(ParametersModel):
@@ -233,13 +234,11 @@ class CartesianController(Controller[CartesianParameters]):
         self._position, self._age = context.reads.reshape(2, -1)
         """Positions and ages of the leader's joints, or of the others."""
         self._frames = FrameTree(urdf, (*joints, *self._others))
+        linear, angular = parameters.linear, parameters.angular
+        speeds = np.nan_to_num(limits.velocity, nan=SPEED).tolist()
+        rates = np.nan_to_num(limits.acceleration, nan=ACCELERATION).tolist()
         self._limits = MotionLimits(
-            tuple(np.nan_to_num(limits.velocity, nan=SPEED).tolist()),
-            tuple(np.nan_to_num(limits.acceleration, nan=ACCELERATION).tolist()),
-            parameters.linear.velocity,
-            parameters.linear.acceleration,
-            parameters.angular.velocity,
-            parameters.angular.acceleration,
+            (linear.velocity, angular.velocity, *speeds), (linear.acceleration, angular.acceleration, *rates)
         )
         posture = [parameters.posture.get(joint) for joint in joints]
         self._solver = Solver(self._chain, limits.lower.tolist(), limits.upper.tolist(), posture)
@@ -248,22 +247,19 @@ class CartesianController(Controller[CartesianParameters]):
         self._motion = TipMotion(self._solver, self._limits, exact=self._exact, steps=self._steps // 2 + 2)
         self._at: Positions = ()
         """Commanded positions, rad; empty while a joint has not answered yet."""
-        self._now_ns, self._period_s = 0, context.period_ns * 1e-9
+        self._now_ns, self._period_s, self._commanded_ns = 0, context.period_ns * 1e-9, 0
+        self._turns_with_tip = self._is_ignoring = False
         self._forget()
 
     def _forget(self) -> None:
-        self._task: Task | None = None
-        self._moves = self._brakes = False
-        self._tried: Transform | None = None
-        """Goal pose of the tip for which `plan` asked, until the answer."""
+        self._task = self._work()
+        self._moves = self._brakes = self._is_held = False
+        self._tried: tuple[TipGoal, Transform] | None = None
+        """Request of `plan` with its goal pose, until the answer."""
         self._goal: Goal | None = None
         self._waiting: TipGoal | None = None
-        self._is_cancelled = False
         self._target: Transform | None = None
-        self._commanded_ns = 0
         self._twist = NO_TWIST
-        self._turns_with_tip = False
-        self._is_held = self._is_ignoring = False
 
     def on_activate(self, time_ns: int) -> None:
         """Hold the joints at their last goals."""
@@ -292,33 +288,27 @@ class CartesianController(Controller[CartesianParameters]):
 
     def on_goal(self, goal: Goal, data: NDArray[np.float64], time_ns: int) -> None:
         """Plan a motion to the pose; a motion that is under way brakes first."""
-        self._goal, self._target, self._is_cancelled = goal, None, False
-        if joint := "" if self._at else self._hold_joints():
-            self._fail(f"joint {joint} has not answered yet")
-        else:
-            self._pass_to(unpacked(data, TipGoal))
+        self._goal, self._target = goal, None
+        self._pass_to(unpacked(data, TipGoal))
 
     def on_command(self, kind: str, data: NDArray[np.float64], time_ns: int) -> None:
         """Follow a twist; a pose that is under way ends as preempted. Or plan without moving."""
-        if kind == "twist":
-            if self._at or not self._hold_joints():
-                self._follow_twist(unpacked(data, TipTwist), time_ns)
-        else:
+        if kind == "plan":
             self._begin_plan(unpacked(data, TipGoal))
+        elif self._at or not self._hold_joints():
+            self._follow_twist(unpacked(data, TipTwist), time_ns)
 
     def _begin_plan(self, asked: TipGoal) -> None:
         self._drop_plan("replaced by a newer request")
         try:
-            if joint := "" if self._at else self._hold_joints():
-                raise ValueError(f"joint {joint} has not answered yet")
-            goal = self._goal_pose(asked)
+            self._tried = asked, self._goal_pose(asked)
         except (LookupError, ValueError) as error:
             self._publish(None, str(error))
             return
         if self._moves or self._goal is not None:
-            self._publish(goal, "the arm moves; ask again when it rests")
+            self._drop_plan(_MOVES)
         else:
-            self._task, self._tried = self._try(asked, goal), goal
+            self._task = self._work()
 
     def _follow_twist(self, twist: TipTwist, time_ns: int) -> None:
         self._turns_with_tip = twist.frame == self._chain.tip
@@ -332,7 +322,7 @@ class CartesianController(Controller[CartesianParameters]):
         self._is_ignoring, self._commanded_ns = False, time_ns
         if self._goal is not None:
             self._end(Outcome.PREEMPTED, "replaced by a twist")
-        self._pass_to(None, (rotated(rotation, twist.linear), rotated(rotation, twist.angular)))
+        self._pass_to(twist=(rotated(rotation, twist.linear), rotated(rotation, twist.angular)))
 
     def on_hold(self, time_ns: int) -> None:
         """Brake from the twist: the stream has ended."""
@@ -341,29 +331,17 @@ class CartesianController(Controller[CartesianParameters]):
 
     def on_cancel(self, goal: Goal, time_ns: int) -> None:
         """Brake on the path; the goal ends when the tip rests."""
-        self._is_cancelled = True
-        self._pass_to(None)
+        self._pass_to()
+        if not self._moves:
+            self._end(Outcome.CANCELLED)
 
-    def _pass_to(self, pose: TipGoal | None, twist: Twist = NO_TWIST) -> None:
+    def _pass_to(self, pose: TipGoal | None = None, twist: Twist = NO_TWIST) -> None:
         """Brake on the path, then pursue a pose or a twist; at once if the tip rests."""
         self._waiting, self._twist, self._brakes = pose, twist, True
-        if not self._moves:
-            self._begin_task()
-
-    def _begin_task(self) -> None:
-        """Begin what waits, from rest."""
-        streams = any(map(any, self._twist))
-        if self._tried is not None and self._waiting is None and not streams:
-            return  # A twist of 0 does not replace a plan
-        self._drop_plan("the arm moves; ask again when it rests")
-        self._task, self._moves, self._brakes = None, False, False
-        if self._is_cancelled:
-            self._is_cancelled = False
-            self._end(Outcome.CANCELLED)
-        if self._waiting is not None:
-            self._task, self._waiting = self._pursue(self._waiting), None
-        elif streams:
-            self._task, self._moves = self._stream_twists(), True
+        # A twist of 0 does not replace a plan.
+        if not self._moves and (self._tried is None or pose is not None or any(map(any, twist))):
+            self._drop_plan(_MOVES)
+            self._task = self._work()
 
     def _end(self, outcome: Outcome, text: str = "") -> None:
         goal, self._goal = self._goal, None
@@ -377,7 +355,9 @@ class CartesianController(Controller[CartesianParameters]):
         self._end(Outcome.ABORTED, text)
 
     def _goal_pose(self, asked: TipGoal) -> Transform:
-        """Return the goal pose of the tip in the base. Raises as `_pose_of`."""
+        """Return the goal pose of the tip in the base. Raises as `_pose_of`, and for a joint."""
+        if joint := "" if self._at else self._hold_joints():
+            raise ValueError(f"joint {joint} has not answered yet")
         if asked.positions:
             return self._chain.pose(asked.positions)
         return asked.target(self._pose_of(asked.frame), self._chain.pose(self._at))
@@ -386,16 +366,13 @@ class CartesianController(Controller[CartesianParameters]):
         """Return the pose of a frame in the base. Raises LookupError or ValueError with what prevents it."""
         if not frame:
             return BASE
-        positions: dict[str, float] = {}
-        for joint in self._frames.movers(frame, self._chain.base):
-            if joint in self.context.joints:
-                positions[joint] = self._at[self.context.joints.index(joint)]
-                continue
-            index = self._others.index(joint)
-            if silence := self._silence(index):
+        movers = self._frames.movers(frame, self._chain.base)
+        for index, joint in enumerate(self._others):
+            if joint in movers and (silence := self._silence(index)):
                 raise ValueError(f"no reply from {joint} {silence}, which moves frame {frame}")
-            positions[joint] = float(self._position[index])
-        return self._frames.pose(frame, self._chain.base, positions)
+        joints, at = (*self.context.joints, *self._others), (*self._at, *self._position.tolist())
+        known = {joint: each for joint, each in zip(joints, at, strict=True) if joint in movers}
+        return self._frames.pose(frame, self._chain.base, known)
 
     def _silence(self, index: int) -> str:
         """Return for how long a joint that is read has not answered; empty if it answers."""
@@ -411,23 +388,37 @@ class CartesianController(Controller[CartesianParameters]):
         self._now_ns, self._period_s = time_ns, period_ns * 1e-9
         if not self._at:
             self._hold_joints()
-        elif self.context.states.has_lost and (self._leader or self._task):
+        if self.context.states.has_lost:
             self._abandon()
-        elif self._leader is not None and self._task is None:
-            self._task, self._moves = self._follow_leader(self._leader), True
-        elif self._task is not None:
+        else:
             for _ in range(self._steps):
-                has_ended = next(self._task, True)
-                if has_ended or self._moves:
+                if next(self._task):
                     break
-            if has_ended:
-                self._begin_task()
         self._write()
+
+    def _work(self) -> Task:
+        """Follow the leader, or do what was asked for last whenever the tip rests."""
+        while True:
+            self._brakes = False
+            if self._leader is not None and self._at:
+                yield from self._follow_leader(self._leader)
+            elif self._waiting is not None:
+                asked, self._waiting = self._waiting, None
+                yield from self._pursue(asked)
+            elif self._tried is not None:
+                yield from self._try(*self._tried)
+            elif any(map(any, self._twist)):
+                yield from self._stream_twists()
+            self._moves = False
+            if self._waiting is None:  # then a goal that has not ended was cancelled
+                self._end(Outcome.CANCELLED)
+            yield True
 
     def _abandon(self) -> None:
         """Hold the goals that were sent: a joint is lost, and the runtime holds the others."""
         self._drop_plan("a joint is lost; ask again when it answers")
-        self._hold_joints()
+        if self._moves:
+            self._hold_joints()
         text = ""
         if self._target is not None and self._at:
             left = residual_of(self._chain.pose(self._at), self._target)
@@ -444,26 +435,26 @@ class CartesianController(Controller[CartesianParameters]):
         else:
             plan = plan_line if asked.path == "line" else plan_joints
             planning = plan(solver, at, target, limits, exact=exact)
-        found = yield from planning
-        if isinstance(found, Path) and asked.seconds is not None and asked.seconds < found.duration_s:
-            needed = math.ceil(found.duration_s * 100) / 100
-            return NoPath(f"the motion takes {needed:.2f} s within its limits; ask for at least this time")
-        return found
+        path = yield from planning
+        if asked.seconds is not None and asked.seconds < path.duration_s:
+            needed = math.ceil(path.duration_s * 100) / 100
+            raise NoPath(f"the motion takes {needed:.2f} s within its limits; ask for at least this time")
+        return path
 
     def _try(self, asked: TipGoal, goal: Transform) -> Task:
         """Plan a motion from rest to a pose, and publish it."""
-        found = yield from self._planned(asked, goal)
-        self._tried = None
-        if isinstance(found, NoPath):
-            self._publish(goal, found.text)
+        try:
+            path = yield from self._planned(asked, goal)
+        except NoPath as refusal:
+            self._publish(goal, str(refusal))
         else:
-            self._publish(goal, _remark(found, asked), found.last, found.duration_s)
+            self._publish(goal, _remark(path, asked), path.last, path.duration_s)
+        self._tried = None
 
     def _drop_plan(self, reason: str) -> None:
         """Answer a request for a plan that is not finished with the reason why it never will be."""
-        goal, self._tried = self._tried, None
-        if goal is not None:
-            self._task = None
+        if self._tried is not None:
+            (_, goal), self._tried = self._tried, None
             self._publish(goal, reason)
 
     def _publish(
@@ -483,12 +474,13 @@ class CartesianController(Controller[CartesianParameters]):
         except (LookupError, ValueError) as error:
             self._fail(str(error))
             return
-        path = yield from self._planned(asked, self._target)
-        if isinstance(path, NoPath):
-            self._end(Outcome.ABORTED, path.text)
+        try:
+            path = yield from self._planned(asked, self._target)
+        except NoPath as refusal:
+            self._end(Outcome.ABORTED, str(refusal))
             return
         self._moves = True
-        yield
+        yield True
         stretch, passed_s, rate, slope = 1.0, 0.0, 1.0, 0.0
         if path.duration_s > 0 and asked.seconds is not None:
             stretch = path.duration_s / asked.seconds
@@ -503,7 +495,7 @@ class CartesianController(Controller[CartesianParameters]):
             if self._goal is not None and not slope:
                 off = float(np.abs(self.context.states.position - self._at).max())
                 self._goal.feedback(passed_s / path.duration_s, off)
-            yield
+            yield True
         goal = self._goal
         if goal is not None and not slope:
             self._goal = None
@@ -513,14 +505,14 @@ class CartesianController(Controller[CartesianParameters]):
         """Return the change of the path's rate with which the joints brake as fast as they may, 1/s."""
         rates = [
             most / max(abs(speed) * stretch, 1e-9)
-            for speed, most in zip(velocities, self._limits.acceleration, strict=True)
+            for speed, most in zip(velocities, self._limits.acceleration[2:], strict=True)
         ]
         # Half of the acceleration, because the path's own curvature needs the rest.
         return max(min(rates) / 2, 1 / _LONGEST_STOP_S)
 
     def _stream_twists(self) -> Task:
         """Move at the twist until it is 0 and the tip rests."""
-        motion = self._motion
+        motion, self._moves = self._motion, True
         motion.begin_motion(self._at)
         while True:
             if self._now_ns - self._commanded_ns > self.parameters.timeout:
@@ -534,7 +526,7 @@ class CartesianController(Controller[CartesianParameters]):
             self._report_hold("" if held < 0 else f"held: joint {self.context.joints[held]} is at its limit")
             if motion.rests and not (any(linear) or any(angular)):
                 return
-            yield
+            yield True
 
     def _report_hold(self, text: str) -> None:
         """Report once why the tip is held; an empty text means that it moves."""
@@ -544,7 +536,7 @@ class CartesianController(Controller[CartesianParameters]):
 
     def _follow_leader(self, chain: Chain) -> Task:
         """Move the tip toward the pose of the leader while the leader answers."""
-        leader, motion = self.parameters.leader, self._motion
+        leader, motion, self._moves = self.parameters.leader, self._motion, True
         motion.begin_motion(self._at)
         anchor: tuple[Transform, Transform] | None = None
         while leader is not None:
@@ -564,12 +556,12 @@ class CartesianController(Controller[CartesianParameters]):
                 twist = motion.twist_to(goal, self._period_s)
             self._report_hold(silence and f"no reply from leader {chain.joints[oldest]} {silence}, holding")
             self._at = motion.advance_joints(*twist, self._period_s)
-            yield
+            yield True
 
 
 def _remark(path: Path, asked: TipGoal) -> str:
     """Return what is not reached at the end of a path; empty if all is."""
-    if asked.rotation is None or path.residual.is_close:
+    if asked.rotation is None or path.residual.suffices(exact=True):
         return ""
     off = math.degrees(path.residual.orientation)
     return f"{off:.1f} deg from the orientation, which the arm cannot reach"

@@ -7,7 +7,7 @@ results depend on the processor, so that a replay on another computer would diff
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from typing import Final, TypeAlias
 
 import msgspec
@@ -79,10 +79,9 @@ class Chain:
         """Joints from the base on: index, True if it slides, and distance to the next one, m."""
         self.length = max(0.01, math.fsum(lengths))
         """Sum of the distances from the first joint to the tip, m: the scale of the arm."""
-        self._axes = [BASE.translation] * len(joints)
-        self._origins = [BASE.translation] * len(joints)
         self._tip_at = BASE.translation
-        self._slides = [slides for _, slides in sorted((step.index, step.slides) for step in steps)]
+        self._axes = [(BASE.translation, BASE.translation, False)] * len(joints)
+        """Axis and origin of each joint in the base, and True if it slides."""
 
     def pose(self, positions: Sequence[float]) -> Transform:
         """Return the pose of the tip in the base at joint positions, rad or m; `jacobian` refers to it."""
@@ -97,7 +96,7 @@ class Chain:
                 x, y, z = x + u * position, y + v * position, z + w * position
             else:
                 turn = product(turn, rotation_about(step.axis, position))
-            self._axes[step.index], self._origins[step.index] = axis, (x, y, z)
+            self._axes[step.index] = axis, (x, y, z), step.slides
         tip = Transform((x, y, z), turn) @ self._end
         self._tip_at = tip.translation
         return tip
@@ -110,13 +109,24 @@ class Chain:
         """
         x, y, z = self._tip_at
         columns: list[Column] = []
-        for (a, b, c), (u, v, w), slides in zip(self._axes, self._origins, self._slides, strict=True):
+        for (a, b, c), (u, v, w), slides in self._axes:
             if slides:
                 columns.append((a, b, c, 0.0, 0.0, 0.0))
             else:
                 p, q, r = x - u, y - v, z - w
                 columns.append((b * r - c * q, c * p - a * r, a * q - b * p, a * lever, b * lever, c * lever))
         return columns
+
+
+def chain_of(urdf: Urdf | None, base: str, tip: str, joints: Container[str]) -> Chain:
+    """Return the chain of a robot with these joints; raise WrongChain if it has none."""
+    if urdf is None:
+        raise WrongChain("tip", "the robot file names no URDF", "write `model: {urdf: NAME.urdf}`")
+    chain = Chain(urdf, base, tip)
+    if lacking := next((joint for joint in chain.joints if joint not in joints), ""):
+        what = f"{lacking} moves {tip}, but is omitted or has no servo"
+        raise WrongChain("tip", what, f"run with {lacking}, or add it to `joints`")
+    return chain
 
 
 def _ways(urdf: Urdf, base: str, tip: str) -> list[UrdfJoint]:

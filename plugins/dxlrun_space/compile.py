@@ -12,8 +12,8 @@ from dxlrun.tooling.features import Compilation, CompileStage, Contribution, Row
 from dxlrun.tooling.plans import JointPlan
 from dxlrun_space import form
 from dxlrun_space.cartesian_controller import CartesianController, CartesianParameters
-from dxlrun_space.chain import Chain, WrongChain
-from dxlrun_space.pose_form import chain_of, solve_pose
+from dxlrun_space.chain import Chain, WrongChain, chain_of
+from dxlrun_space.pose_form import solve_pose
 from dxlrun_space.reach import dexterity
 from dxlrun_space.solver import CLOSE_RAD, Orientation
 
@@ -30,7 +30,8 @@ def compile_tip_poses(compilation: Compilation) -> Contribution:
         if body is None and file.robot.model is not None:
             break
         try:
-            chain = chain_of(pose, None if body is None else body.urdf)
+            known = (*file.robot.joints, *file.description.omitted)
+            chain = chain_of(None if body is None else body.urdf, pose.base, pose.tip, known)
             if omitted := next((joint for joint in chain.joints if joint in file.description.omitted), ""):
                 what = f"pose {name} is omitted, because {omitted} moves {pose.tip}"
                 file.warning(file.key("tip_poses", name), what, f"run with {omitted} to have it")

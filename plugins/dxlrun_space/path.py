@@ -19,7 +19,7 @@ import numpy as np
 from dxlrun import Floats
 from dxlrun.tooling.robots import Transform
 from dxlrun_space.chain import scaled, shifted
-from dxlrun_space.solver import CLOSE_M, Residual, Solver, distance, residual_of
+from dxlrun_space.solver import Residual, Solver, distance, residual_of
 
 Positions = tuple[float, ...]
 
@@ -47,26 +47,14 @@ _ROUNDING: Final = 1e-6
 
 
 class MotionLimits(msgspec.Struct, frozen=True):
-    """Limits of a motion, all above 0: of each joint, rad/s and rad/s^2, and of the tip."""
+    """Limits of a motion, all above 0: of the tip's translation and rotation, and of each joint."""
 
-    velocity: Positions
+    velocity: Positions  # m/s, rad/s, and rad/s or m/s
     acceleration: Positions
-    linear_velocity: float  # m/s
-    linear_acceleration: float  # m/s^2
-    angular_velocity: float  # rad/s
-    angular_acceleration: float  # rad/s^2
-
-    def __post_init__(self) -> None:
-        """Raise ValueError for a limit with which nothing would move."""
-        first, second, *tip = msgspec.structs.astuple(self)
-        if not all(limit > 0 for limit in (*first, *second, *tip)):
-            raise ValueError(f"limits of a motion must be above 0: {self}")
 
 
-class NoPath(msgspec.Struct, frozen=True):
-    """Failure to find a path: the reason as text, with the remaining distance."""
-
-    text: str
+class NoPath(Exception):
+    """Raised if there is no path, with the reason and the remaining distance."""
 
 
 class Path:
@@ -110,8 +98,8 @@ class Path:
         return tuple(within.tolist()), tuple(velocities.tolist())
 
 
-Planning = Generator[None, None, Path | NoPath]
-"""Planning of a path, which it returns: each `next` has a bounded cost."""
+Planning = Generator[None, None, Path]
+"""Planning of a path, which it returns, or raises NoPath: each `next` has a bounded cost."""
 
 
 def plan_joints(
@@ -119,8 +107,8 @@ def plan_joints(
 ) -> Planning:
     """Plan a motion in which all joints turn evenly from the start to the pose."""
     found = yield from solver.search(target, start, exact=exact)
-    if not suffices(found.residual, exact):
-        return NoPath(out_of_reach(found.residual, exact))
+    if not found.residual.suffices(exact):
+        raise NoPath(out_of_reach(found.residual, exact))
     return (yield from plan_positions(solver, start, found.positions, target, limits))
 
 
@@ -130,7 +118,7 @@ def plan_positions(
     """Plan a motion in which all joints turn evenly from the start to goal positions."""
     for joint, at, low, high in zip(solver.chain.joints, goal, solver.lower, solver.upper, strict=True):
         if not low - _ROUNDING <= at <= high + _ROUNDING:
-            return NoPath(f"the pose has {joint} outside its limits")
+            raise NoPath(f"the pose has {joint} outside its limits")
     count = _count(max(abs(b - a) for a, b in zip(start, goal, strict=True)) / _NODE_RAD)
     places = np.arange(count + 1) / count
     nodes = np.array(start) + places[:, None] * (np.array(goal) - start)
@@ -144,8 +132,8 @@ def plan_line(
     """Plan a motion in which the tip moves on a straight line and turns about one axis to the pose."""
     search = solver.search(target, start, exact=True) if exact else solver.search_place(target, start)
     found = yield from search
-    if not suffices(found.residual, exact):
-        return NoPath(out_of_reach(found.residual, exact))
+    if not found.residual.suffices(exact):
+        raise NoPath(out_of_reach(found.residual, exact))
     begin = solver.chain.pose(start)
     way, turn = distance(begin, target)
     length = math.hypot(*way)
@@ -157,13 +145,13 @@ def plan_line(
         here = shifted(begin, scaled(way, place), scaled(turn, place))
         found = yield from solver.search_from(here, _guess(places, nodes, place), exact=exact)
         effort = _effort([*places[-2:], place], [*nodes[-2:], found.positions])
-        is_solved = suffices(found.residual, exact)
+        is_solved = found.residual.suffices(exact)
         if is_solved and effort <= 1.0:
             places.append(place)
             nodes.append(found.positions)
         elif step <= longest * 0.5**_SPLITS or len(nodes) >= _MOST_SPLIT:
             passed, whole = places[-1] * length * 1e3, length * 1e3
-            return NoPath(
+            raise NoPath(
                 f"the straight line ends after {passed:.0f} of {whole:.0f} mm, at a limit of a joint or "
                 "where a joint would leap; write path=joints"
             )
@@ -177,11 +165,6 @@ def out_of_reach(residual: Residual, exact: bool) -> str:
     """Return the reason why a pose is refused, with the distance of the nearest solution."""
     turn = f" and {math.degrees(residual.orientation):.1f} deg" if exact else ""
     return f"the pose is out of reach; the nearest is {residual.position * 1e3:.1f} mm{turn} away"
-
-
-def suffices(residual: Residual, exact: bool) -> bool:
-    """Return True if a solution has the position and, if `exact`, the orientation."""
-    return residual.is_close if exact else residual.position <= CLOSE_M
 
 
 def _count(needed: float) -> int:
@@ -248,21 +231,19 @@ def _bounds(
     chords, begin, end = np.diff(nodes, axis=0) / ways[:, None], slopes[:-1], slopes[1:]
     rates = np.maximum.reduce(np.abs((begin, end, 1.5 * chords - (begin + end) / 4)))
     bends = np.maximum.reduce(np.abs((6 * chords - 4 * begin - 2 * end, 6 * chords - 2 * begin - 4 * end)))
-    rates, bends = np.maximum(rates, _LEAST), np.maximum(bends / ways[:, None], _LEAST)
     places = np.diff([pose.translation for pose in poses], axis=0) / ways[:, None]
-    linear = np.maximum(_lengths(places), _LEAST)
     # The length of a short turn is twice that of the way of its quaternion.
-    angular = np.maximum(2 * _lengths(np.diff([pose.rotation for pose in poses], axis=0)) / ways, _LEAST)
-    share, tip_share = _SHARE * np.array(limits.acceleration), _TIP_SHARE * limits.linear_acceleration
-    joints = np.minimum(np.array(limits.velocity) / rates, np.sqrt(share / bends)).min(axis=1)
-    tops = np.minimum.reduce((joints, limits.linear_velocity / linear, limits.angular_velocity / angular))
-    changes = np.minimum.reduce(
-        ((share / rates).min(axis=1), tip_share / linear, limits.angular_acceleration / angular)
+    turns = 2 * _lengths(np.diff([pose.rotation for pose in poses], axis=0)) / ways
+    rates = np.maximum(np.column_stack((_lengths(places), turns, rates)), _LEAST)
+    shares = np.array(limits.acceleration) * (_TIP_SHARE, 1.0, *(_SHARE,) * len(nodes[0]))
+    tops = np.minimum(
+        (limits.velocity / rates).min(axis=1),
+        np.sqrt(shares[2:] / np.maximum(bends / ways[:, None], _LEAST)).min(axis=1),
     )
     bend = np.maximum(_lengths(np.diff(places, axis=0)) / ((ways[:-1] + ways[1:]) / 2), _LEAST)
-    near = np.pad(changes, 1, "edge")
+    near = np.pad((shares / rates).min(axis=1), 1, "edge")
     gains = 2 * ways * np.minimum.reduce((near[:-2], near[1:-1], near[2:]))
-    return np.minimum.reduce((tops[:-1], tops[1:], np.sqrt(tip_share / bend))).tolist(), gains.tolist()
+    return np.minimum.reduce((tops[:-1], tops[1:], np.sqrt(shares[0] / bend))).tolist(), gains.tolist()
 
 
 def _lengths(rows: Floats) -> Floats:

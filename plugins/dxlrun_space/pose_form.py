@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 from dxlrun.tooling.features import PoseStage
 from dxlrun.tooling.plans import JointPlan
-from dxlrun.tooling.robots import Transform, Urdf, read_urdf
-from dxlrun_space.chain import BASE, Chain, WrongChain
+from dxlrun.tooling.robots import Transform, read_urdf
+from dxlrun_space.chain import BASE, Chain, WrongChain, chain_of
 from dxlrun_space.form import TipPose, rotation_of
-from dxlrun_space.path import out_of_reach, suffices
+from dxlrun_space.path import out_of_reach
 from dxlrun_space.solver import Orientation, Solver, demands_orientation, finish_search
 
 
@@ -33,10 +33,6 @@ def solve_pose(
 
     `orientations` are the parameters `orientation` of the controllers that move the tip.
     """
-    for joint in chain.joints:
-        if joint not in joints:
-            what = f"{joint} moves {pose.tip}, but is omitted or has no servo"
-            raise WrongChain("tip", what, f"run with {joint}, or add it to `joints`")
     for joint in pose.near:
         if joint not in chain.joints:
             raise WrongChain("near", f"{joint} does not move {pose.tip}", f"write {', '.join(chain.joints)}")
@@ -51,21 +47,14 @@ def solve_pose(
     target = Transform((pose.x, pose.y, pose.z), rotation or BASE.rotation)
     search = solver.search(target, start, exact=exact) if rotation else solver.search_place(target, start)
     found = finish_search(search)
-    if not suffices(found.residual, exact):
+    if not found.residual.suffices(exact):
         fix = "move the pose, or give it another orientation"
         raise WrongChain("", out_of_reach(found.residual, exact), fix)
     return SolvedPose(solver, found.positions, found.residual.orientation if rotation else 0.0)
 
 
-def chain_of(pose: TipPose, urdf: Urdf | None) -> Chain:
-    """Return the chain of a pose; raise WrongChain if the robot has none."""
-    if urdf is None:
-        raise WrongChain("tip", "the robot file names no URDF", "write `model: {urdf: NAME.urdf}`")
-    return Chain(urdf, pose.base, pose.tip)
-
-
 def _joints_of(pose: TipPose, urdf: str | None, joints: Mapping[str, JointPlan]) -> dict[str, float]:
-    chain = chain_of(pose, None if urdf is None else read_urdf(urdf))
+    chain = chain_of(None if urdf is None else read_urdf(urdf), pose.base, pose.tip, joints)
     return dict(zip(chain.joints, solve_pose(pose, chain, joints).positions, strict=True))
 
 

@@ -13,7 +13,7 @@ from dxlrun import Floats, InputError
 from dxlrun.tooling.output import check_target, show_parts, write_target
 from dxlrun.tooling.robots import read_urdf
 from dxlrun.tooling.verbs import Assignment, RobotPath, compiled, missing_extra
-from dxlrun_space.chain import Chain, WrongChain, spread
+from dxlrun_space.chain import Chain, WrongChain, chain_of, spread
 
 POSTURES: Final = 20_000
 
@@ -38,11 +38,7 @@ def draw_reach(robot: RobotPath, tip: str, picture: Path, /, *assignments: Assig
     plan = compiled(robot, assignments, (), None).plan
     limits = {joint.name: (joint.lower, joint.upper) for joint in plan.loop.joints}
     try:
-        if plan.urdf is None:
-            raise WrongChain("", f"{robot} names no URDF", "write `model: {urdf: NAME.urdf}`")
-        chain = Chain(read_urdf(plan.urdf), base, tip)
-        if missed := [joint for joint in chain.joints if joint not in limits]:
-            raise WrongChain("", f"{missed[0]} moves {tip}, but has no servo", f"add {missed[0]} to `joints`")
+        chain = chain_of(None if plan.urdf is None else read_urdf(plan.urdf), base, tip, limits)
     except WrongChain as wrong:
         raise InputError(str(wrong)) from None
     lower, upper = zip(*(limits[joint] for joint in chain.joints), strict=True)

@@ -47,6 +47,8 @@ _POSTURE: Final = 1e-5
 """Lever of the distance from the posture."""
 _PULL: Final = 0.02
 """Lever of the posture of an arm with more joints than a pose needs."""
+_FINE: Final = 0.05
+"""Part of a solution's errors below which a step would not matter, even between close nodes of a path."""
 _LEASH: Final = 0.05
 """Largest distance in which the posture attracts a joint without a leap, rad or m."""
 _LONGEST_STEP: Final = 1.0
@@ -78,15 +80,12 @@ class Residual(msgspec.Struct, frozen=True):
     orientation: float
     """rad"""
 
-    @property
-    def is_close(self) -> bool:
-        """True if position and orientation are those of the target."""
-        return self.position <= CLOSE_M and self.orientation <= CLOSE_RAD
+    def suffices(self, exact: bool, share: float = 1.0) -> bool:
+        """Return True if a pose has the position of its target and, if `exact`, the orientation.
 
-    @property
-    def is_exact(self) -> bool:
-        """True if another step would not matter, even between nodes of a path that are close together."""
-        return self.position <= CLOSE_M / 20 and self.orientation <= CLOSE_RAD / 20
+        `share` is the part of the errors of a solution that is permitted.
+        """
+        return self.position <= share * CLOSE_M and (not exact or self.orientation <= share * CLOSE_RAD)
 
 
 class Solution(msgspec.Struct, frozen=True):
@@ -148,7 +147,6 @@ class Solver:
         self.lower, self.upper = tuple(lower), tuple(upper)
         self._posture = tuple(posture) or (None,) * len(chain.joints)
         self._redundant = len(chain.joints) > FULL and any(each is not None for each in self._posture)
-        self._tendency = (_POSTURE * chain.length) ** 2
         self._samples = [*map(tuple, spread(lower, upper, SAMPLES).tolist())]
         self._table = np.array(
             [(*pose.translation, *pose.rotation) for pose in map(chain.pose, self._samples)]
@@ -173,12 +171,12 @@ class Solver:
         The result is close to the target, or the nearest that was found: by position first unless `exact`.
         """
         best = yield from self._descend(target, start, EXACT, is_patient=False)
-        if not best.residual.is_close:
+        if not best.residual.suffices(exact=True):
             place = yield from self.search_place(target, best.positions)
             if place.residual.position > _NEAR * self.chain.length:
                 return (yield from self.search_from(target, place.positions, exact=False))
             best = yield from self._try_starts(target, best, EXACT, STARTS)
-            if not exact and not best.residual.is_close:
+            if not exact and not best.residual.suffices(exact=True):
                 best = yield from self.search_from(target, best.positions, exact=False)
                 if best.residual.position > max(CLOSE_M, place.residual.position):
                     best = yield from self.search_from(target, place.positions, exact=False)
@@ -193,7 +191,7 @@ class Solver:
 
     def _try_starts(self, target: Transform, best: Solution, lever: float, count: int) -> Search:
         for each in self._nearest(target, lever, count):
-            if best.residual.is_close if lever else best.residual.position <= CLOSE_M:
+            if best.residual.suffices(exact=lever > 0):
                 return best
             found = yield from self._descend(target, each, lever, is_patient=not lever)
             best = min(best, found, key=lambda one: one.cost)
@@ -220,11 +218,10 @@ class Solver:
         lever = EXACT if exact else NEAREST
         if self._redundant:
             # First a strong pull, which moves the tip by 0.1 mm, then the pose from there.
-            self._tendency = (_PULL * self.chain.length) ** 2
-            start = (yield from self._descend(target, start, lever, steps, leash)).positions
-            self._tendency, leash = (_POSTURE * self.chain.length) ** 2, 0.0
+            pulled = yield from self._descend(target, start, lever, steps, leash, pull=_PULL)
+            start, leash = pulled.positions, 0.0
         found = yield from self._descend(target, start, lever, steps, leash)
-        if not exact and found.residual.position > CLOSE_M:
+        if not exact and not found.residual.suffices(exact=False):
             # Near a singularity even the small lever of the orientation moves the position.
             found = yield from self._descend(target, found.positions, 0.0, steps, leash)
         return found
@@ -238,8 +235,10 @@ class Solver:
         leash: float = math.inf,
         *,
         is_patient: bool = True,
+        pull: float = _POSTURE,
     ) -> Search:
         scale = self.chain.length
+        lever, tendency = lever * scale, (pull * scale) ** 2
         first, near, least = (each * scale * scale for each in _DAMPING)
         damping = near if is_patient else first
         now = self._inside(start)
@@ -247,19 +246,18 @@ class Solver:
             a if b is None else min(max(b, a - leash), a + leash)
             for a, b in zip(now, self._posture, strict=True)
         ]
-        best = self._estimate(target, now, posture, lever * scale)
+        best = self._estimate(target, now, posture, lever, tendency)
         before = last = math.inf
         for _ in range(steps):
-            if best.residual.is_exact and self._tendency < (lever * scale) ** 2 * 1e-3:
+            is_strong = 0.0 < lever * lever * 1e-3 <= tendency  # The posture still moves the joints.
+            if best.residual.suffices(lever > 0, _FINE) and not is_strong:
                 break
-            if lever == 0.0 and best.residual.position <= CLOSE_M / 20:
-                break
-            change = self._step(best, damping)
+            change = self._step(best, damping + tendency)
             trial = self._inside([a + b for a, b in zip(best.positions, change, strict=True)])
             if max(abs(a - b) for a, b in zip(trial, best.positions, strict=True)) < _STILL:
                 break
             yield
-            tried = self._estimate(target, trial, posture, lever * scale)
+            tried = self._estimate(target, trial, posture, lever, tendency)
             if tried.cost < best.cost:
                 is_still = tried.cost > _STALLING * best.cost
                 best, damping = tried, max(least, damping * 0.1)
@@ -267,17 +265,22 @@ class Solver:
                     break
             else:
                 damping = max(damping, 1e-9 * scale * scale) * 5
-            if not is_patient and best.cost > _FAILING * before and not best.residual.is_close:
+            if not is_patient and best.cost > _FAILING * before and not best.residual.suffices(exact=True):
                 break
             before, last = last, best.cost
         return best
 
     def _estimate(
-        self, target: Transform, positions: tuple[float, ...], posture: Sequence[float], lever: float
+        self,
+        target: Transform,
+        positions: tuple[float, ...],
+        posture: Sequence[float],
+        lever: float,
+        tendency: float,
     ) -> Solution:
         """Return the distance at joint positions with its linear model; the lever is in m/rad."""
         way, turn = distance(self.chain.pose(positions), target)
-        columns, tendency = self.chain.jacobian(lever), self._tendency
+        columns = self.chain.jacobian(lever)
         ways = [b - a for a, b in zip(positions, posture, strict=True)]
         (x, y, z), (u, v, w) = way, scaled(turn, lever)
         gradient = [
@@ -293,7 +296,7 @@ class Solver:
         rows = zip(model.gradient, model.positions, self.lower, self.upper, strict=True)
         free = [not (now >= upper if slope > 0 else now <= lower) for slope, now, lower, upper in rows]
         columns = [*compress(model.columns, free)]
-        solved = solve(normal_matrix(columns, damping + self._tendency), [*compress(model.gradient, free)])
+        solved = solve(columns, [*compress(model.gradient, free)], damping)
         longest = max(map(abs, solved), default=0.0)
         scale = _LONGEST_STEP / longest if longest > _LONGEST_STEP else 1.0
         moves = iter(solved)
@@ -303,34 +306,22 @@ class Solver:
         return tuple(map(min, map(max, positions, self.lower), self.upper))
 
 
-def normal_matrix(columns: Sequence[Column], damping: float) -> list[list[float]]:
-    """Return the lower triangle of J^T J + damping."""
+def solve(columns: Sequence[Column], right: Sequence[float], damping: float) -> list[float]:
+    """Solve (J^T J + damping) x = right by elimination; this matrix needs no pivots."""
+    # Upper triangle, with the right side as last column.
     rows = [
-        [a * u + b * v + c * w + d * x + e * y + f * z for u, v, w, x, y, z in columns[:index]]
-        for index, (a, b, c, d, e, f) in enumerate(columns, 1)
+        [a * u + b * v + c * w + d * x + e * y + f * z for u, v, w, x, y, z in columns[index:]]
+        for index, (a, b, c, d, e, f) in enumerate(columns)
     ]
-    for row in rows:
-        row[-1] += damping
-    return rows
-
-
-def solve(lower: Sequence[Sequence[float]], right: Sequence[float]) -> list[float]:
-    """Solve a positive definite system, given by its lower triangle (Cholesky).
-
-    Sums are by `fsum`, because `sum` rounds in another way from Python 3.12 on.
-    """
-    factor: list[list[float]] = []
-    forward: list[float] = []
-    for row, value in zip(lower, right, strict=True):
-        found: list[float] = []
-        for element, other in zip(row, factor, strict=False):
-            found.append((element - math.fsum(map(mul, found, other))) / other[-1])
-        found.append(math.sqrt(max(row[-1] - math.fsum(map(mul, found, found)), 1e-300)))
-        factor.append(found)
-        forward.append((value - math.fsum(map(mul, found, forward))) / found[-1])
+    for row, value in zip(rows, right, strict=True):
+        row[0] += damping
+        row.append(value)
+    for index, (first, *rest) in enumerate(rows, 1):
+        for place, below in enumerate(rows[index:]):
+            share = rest[place] / first
+            below[:] = [a - share * b for a, b in zip(below, rest[place:], strict=False)]
     solution: list[float] = []
-    for row in reversed(factor):
-        value = forward.pop() / row[-1]
-        forward = [a - value * b for a, b in zip(forward, row, strict=False)]
-        solution.append(value)
-    return solution[::-1]
+    for first, *rest, value in reversed(rows):
+        # By `fsum`, because `sum` rounds in another way from Python 3.12 on.
+        solution.insert(0, (value - math.fsum(map(mul, rest, solution))) / first)
+    return solution

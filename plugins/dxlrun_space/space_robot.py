@@ -15,14 +15,6 @@ Angles = Sequence[float | str] | None
 """Angles in rad, or as texts with their units."""
 
 
-class PoseRefused(Refused):
-    """A pose was refused, mostly one out of reach or malformed, or the arm did not reach it.
-
-    `code` is that of the refusal (`invalid`, `goal_refused`), or the outcome of the goal: `aborted`,
-    `missed`, `cancelled`, `preempted`.
-    """
-
-
 class SpaceRobot(RemoteRobot):
     """A running robot whose arms go to poses.
 
@@ -62,7 +54,8 @@ class SpaceRobot(RemoteRobot):
             timeout: Longest wait, s; None waits without limit.
 
         Raises:
-            PoseRefused: The pose is malformed or out of reach, or the motion did not end there.
+            Refused: The pose is malformed (`code` is `invalid`) or out of reach (`goal_refused`), or the
+                motion did not end there (`aborted`, `missed`, `cancelled` or `preempted`).
             GoalTimeout: The motion has not ended within `timeout`.
             DxlrunError: The robot has no arm of this name, or is gone.
         """
@@ -79,13 +72,10 @@ class SpaceRobot(RemoteRobot):
             raise DxlrunError(f"{self.name} has no arm {arm}; {suggestion(arm, arms)}")
         if not arm and len(arms) > 1:
             raise DxlrunError(f"{self.name} has {len(arms)} arms; name one of {', '.join(arms)}")
-        try:
-            (goal,) = self.send(arm or arms[0], "pose", given).goals
-        except Refused as refused:
-            raise PoseRefused(str(refused), code=refused.code, fields=refused.fields) from None
+        (goal,) = self.send(arm or arms[0], "pose", given).goals
         state = goal.wait(timeout)
         if state.status != "reached":
-            raise PoseRefused(state.describe_outcome(), code=state.status, fields={"goal": state.number})
+            raise Refused(state.describe_outcome(), code=state.status, fields={"goal": state.number})
         return state
 
     def _arms(self) -> list[str]:

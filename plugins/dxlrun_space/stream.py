@@ -50,7 +50,7 @@ class _State(msgspec.Struct, frozen=True):
         return (x, y, z), (u, v, w)
 
     def sizes(self, speeds: Sequence[float]) -> list[float]:
-        """Return linear and angular speed of the tip, and the size of each joint's speed."""
+        """Return the sizes of all speeds, in the order of `MotionLimits`."""
         return [*map(_length, self.twist_at(speeds)), *map(abs, speeds)]
 
 
@@ -70,15 +70,13 @@ class TipMotion:
 
     def __init__(self, solver: Solver, limits: MotionLimits, *, exact: bool, steps: int) -> None:
         self._solver, self._exact, self._steps = solver, exact, steps
-        # In the order of `sizes`.
-        self._velocity = (limits.linear_velocity, limits.angular_velocity, *limits.velocity)
-        self._acceleration = (limits.linear_acceleration, limits.angular_acceleration, *limits.acceleration)
+        self._velocity, self._acceleration = limits.velocity, limits.acceleration
         reach, self._reaches = 0.0, list[tuple[int, bool, float]]()
         for index, slides, length in reversed(solver.chain.links):
             ends = np.clip((solver.lower[index], solver.upper[index]), -math.pi, math.pi)
             reach += length + slides * float(np.abs(ends).max())
             self._reaches.insert(0, (index, slides, reach))
-        self.begin_motion((0.0,) * len(limits.velocity))
+        self.begin_motion((0.0,) * len(solver.lower))
 
     def begin_motion(self, positions: Positions) -> None:
         """Begin at rest at joint positions."""

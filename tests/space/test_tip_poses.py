@@ -9,12 +9,12 @@ import pytest
 from tests.kit.commands import Dxlrun
 from tests.kit.judged_arms import Arm, example, turn
 
-from dxlrun import DxlrunError, RemoteRobot
+from dxlrun import DxlrunError, Refused, RemoteRobot
 from dxlrun.compile.robot_compiler import compile_files
 from dxlrun.testing import plan_of
 from dxlrun.tooling.runs import VirtualLink
 from dxlrun_space import reach, space_robot
-from dxlrun_space.space_robot import PoseRefused, SpaceRobot
+from dxlrun_space.space_robot import SpaceRobot
 
 ROBOTS = Path(__file__).parents[2] / "robots"
 FOLLOWER = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll")
@@ -105,7 +105,7 @@ def test_move_to_waits_for_the_pose_and_raises_what_refused_it(monkeypatch: pyte
         assert robot.move_to(x=0.2, y=0, z="15 cm", rpy=[0, "60 deg", 0], path="joints").reached
         assert tip(robot) == pytest.approx((20, 0, 15), abs=0.3)
         before = robot.states().position.tolist()
-        with pytest.raises(PoseRefused, match=r"out of reach; the nearest is \d+\.\d mm away") as refused:
+        with pytest.raises(Refused, match=r"out of reach; the nearest is \d+\.\d mm away") as refused:
             robot.move_to("arm", x=0.9)
         assert refused.value.code == "goal_refused"
         assert robot.states().position.tolist() == pytest.approx(before, abs=2e-3)
@@ -114,13 +114,15 @@ def test_move_to_waits_for_the_pose_and_raises_what_refused_it(monkeypatch: pyte
         named = robot.link.gateways_link.plan.poses["above"]
         assert robot.move_to(pose="above").reached
         assert robot.states().position[:4] == pytest.approx([*named.values()], abs=5e-3)
-        for x, frame, text in (
-            (math.nan, "", "nan"),
-            ("3deg", "", "3deg"),
-            (0.2, "no", "frame no not"),
+        for wrong, text in (
+            ({"x": math.nan}, "nan"),
+            ({"x": "3deg"}, "3deg"),
+            ({"dz": "5"}, "has no unit"),
+            ({"x": 0.2, "frame": "no"}, "frame no not"),
+            ({"rpy": [0, 90, 0]}, "90 rad is more than a turn"),
         ):
-            with pytest.raises(PoseRefused, match=text) as refused:
-                robot.move_to(x=x, frame=frame)
+            with pytest.raises(Refused, match=text) as refused:
+                robot.move_to(**wrong)
             assert refused.value.code == "invalid"
         with pytest.raises(DxlrunError, match="has no arm amr; did you mean arm"):
             robot.move_to("amr", dz=0.01)
