@@ -122,6 +122,7 @@ def test_each_allowed_skip_is_one_of_the_tests() -> None:
         ("plugins/dxlrun_lab/stress.py", {"dxlrun_lab"}),
         ("plugins/dxlrun_view/src/dxlrun_view/web/page.js", {"dxlrun_view"}),
         ("robots/bioloid_torso.yaml", {"robots"}),
+        ("robots/robot.schema.json", set()),
         ("docs/index.md", set()),
         ("bench/cycle_trace.py", {"bench"}),
         ("README.md", set()),
