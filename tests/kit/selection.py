@@ -210,8 +210,9 @@ class Selection:
         items[:] = deal_tests([item for item in items if item not in left_out], workers)
 
     def _is_needless(self, item: pytest.Item) -> bool:
-        affected = str(item.path.relative_to(item.config.rootpath)) in self._affected
-        return bool(item.get_closest_marker("long")) and not self._everything and not affected
+        if self._everything or not item.get_closest_marker("long"):
+            return False
+        return str(item.path.relative_to(item.config.rootpath)) not in self._affected
 
     def pytest_deselected(self, items: list[pytest.Item]) -> None:
         """Count what is left out."""

@@ -1,8 +1,8 @@
 """A process of simulated servos that is stopped for a while, or answers late on purpose, and its host."""
 
+import math
 import os
 import signal
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -31,11 +31,24 @@ def ping() -> Program[Reply]:
     return (yield plan_line(PLAN).ping(1))
 
 
+class Stalls(StallCounter):
+    """Lets a stopped process continue when it has been awaited for long enough."""
+
+    def __init__(self, pid: int) -> None:
+        super().__init__()
+        self.pid, self.longest_ns = pid, math.inf
+
+    def count(self, begin_ns: int, end_ns: int) -> None:
+        super().count(begin_ns, end_ns)
+        if self.waited_ns > self.longest_ns:
+            os.kill(self.pid, signal.SIGCONT)
+
+
 class Host:
     """A host of two servos in another process."""
 
-    def __init__(self, lines: Lines, stalls: StallCounter, pid: int) -> None:
-        self.lines, self.stalls, self.pid = lines, stalls, pid
+    def __init__(self, lines: Lines, stalls: Stalls) -> None:
+        self.lines, self.stalls = lines, stalls
 
     def ask(self) -> Reply:
         (reply,) = self.lines.run_programs([ping()])
@@ -43,17 +56,14 @@ class Host:
         return reply
 
     @contextmanager
-    def stopped(self, seconds: float) -> Iterator[None]:
-        """Stop the process of the servos; a thread lets it continue, or the end of the context."""
-        os.kill(self.pid, signal.SIGSTOP)
-        timer = threading.Timer(seconds, os.kill, (self.pid, signal.SIGCONT))
-        timer.start()
+    def stopped(self, longest_s: float = math.inf) -> Iterator[None]:
+        """Stop the process of the servos until it has been awaited for so long, or the end of the context."""
+        self.stalls.longest_ns = self.stalls.waited_ns + longest_s * 1e9
+        os.kill(self.stalls.pid, signal.SIGSTOP)
         try:
             yield
         finally:
-            timer.cancel()
-            timer.join()
-            os.kill(self.pid, signal.SIGCONT)
+            os.kill(self.stalls.pid, signal.SIGCONT)
 
 
 @contextmanager
@@ -66,10 +76,10 @@ def simulated(*faults: str) -> Iterator[Host]:
     try:
         path = (first_message(child).ports or {})["main"]
         with open_serial(path, PLAN.baud_rate) as line:
-            stalls = StallCounter()
+            stalls = Stalls(child.process.pid)
             port = SimulatedPort(line.fileno(), "sim", SimulationProgress(progress).line(0), stalls)
             lines = Lines([PLAN], SerialPorts([port]), MonotonicClock(), PacketSink())
-            yield Host(lines, stalls, child.process.pid)
+            yield Host(lines, stalls)
     finally:
         child.kill()
         os.close(progress)
@@ -79,13 +89,13 @@ def simulated(*faults: str) -> Iterator[Host]:
 def test_reply_is_awaited_while_the_process_is_stopped_but_not_for_ever() -> None:
     with simulated() as host:
         assert host.ask().outcome is OK
-        with host.stopped(0.2):
+        with host.stopped(0.005):
             reply = host.ask()
         assert reply.outcome is OK
-        assert host.stalls.waited_ns > 100_000_000
-        assert reply.stalled_ns > 100_000_000
+        assert host.stalls.waited_ns > 5_000_000
+        assert reply.stalled_ns > 5_000_000
         before_ns = host.stalls.waited_ns
-        with host.stopped(20.0):
+        with host.stopped():
             assert [host.ask().outcome for _ in range(3)] == [TIMEOUT] * 3
             # it is given up once: three times the bound would be 1.5 s
             assert 0 < host.stalls.waited_ns - before_ns < 1_400_000_000
@@ -105,7 +115,7 @@ def test_servo_that_is_silent_or_late_on_purpose_is_lost(fault: str) -> None:
 def test_lateness_of_the_process_is_told_apart_from_that_of_the_servo() -> None:
     with simulated("slow servo=1 by=30ms") as host:
         times = ReplyLateness()
-        with host.stopped(0.1):
+        with host.stopped(0.0):
             host.lines.run_programs([extend_timeouts(ping(), times=times)])
         (late,) = times.late_ns
-        assert 29_000_000 < late < 60_000_000  # of more than 100 ms
+        assert 29_000_000 < late < 60_000_000  # of more than 240 ms, by which the timeout is longer
