@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from msgspec.structs import replace
-from tests.kit.rigs import make_rig
+from tests.kit.rigs import make_plan, make_rig
 
 from dxlrun.channels.event_records import EventCode
 from dxlrun.dynamixel.findings import Findings
@@ -26,7 +26,7 @@ from dxlwire.control_table import (
     read_control_table,
 )
 from dxlwire.control_table.deviation import UNDESCRIBED, Deviation, deviation_of, deviations_by_name
-from dxlwire.plan.planning import Wiring, bus_plan, position_layout
+from dxlwire.plan.planning import position_layout
 
 pytestmark = pytest.mark.long
 
@@ -52,17 +52,8 @@ def full_range(table: ControlTable) -> BusPlan:
             initial = table.items[name].initial or 0
             ends[end] = initial if end else max(ends[end], initial)
     lower, upper = ((end + left) * table.rad_per_tick for end, left in zip(ends, (2, -2), strict=True))
-    joint = Wiring("joint", 0, 1, table, 0.0, 1, lower, upper, continuous=False)
-    plan = bus_plan(
-        name="main",
-        port="sim",
-        baud_rate=1_000_000,
-        latency_ns=0,
-        return_delay_ns=500_000,
-        joints=[joint],
-        protocol=table.protocol,
-    )
-    return replace(plan, fast=(False,) * len(plan.groups))
+    joint = {"joints": ["joint"], "reference": 0.0, "direction": 1, "lower": lower, "upper": upper}
+    return make_plan((1,), protocol=table.protocol, model=table.model, **joint)
 
 
 class Bench:

@@ -214,10 +214,6 @@ class TestOneBus:
         assert rig.packets.received() == rig.out_of_bus()
 
 
-def goal_tick(servo, position):
-    return round((servo.direction * position + servo.reference) / servo.rad_per_tick)
-
-
 def read_takes(rig):
     """Return the time of one exchange, ns."""
     start = rig.clock.now_ns()
@@ -241,9 +237,11 @@ def test_a_cycle_is_eight_reads_and_one_sync_write(ax):
     ax.goals.velocity[:] = 1.0
     ax.cycle()
     servos = ax.plans[0].servos
+    angles = [servo.direction * ax.goals.position[servo.row] + servo.reference for servo in servos]
+    ticks = [round(angle / servo.rad_per_tick) for servo, angle in zip(servos, angles, strict=True)]
     goals = {
-        servo.servo_id: goal_tick(servo, ax.goals.position[servo.row]).to_bytes(2, "little") + b"\x56\x00"
-        for servo in servos
+        servo.servo_id: tick.to_bytes(2, "little") + b"\x56\x00"
+        for servo, tick in zip(servos, ticks, strict=True)
     }
     reads = [read.packet for read in ax.plans[0].reads]
     assert ax.into_bus()[count:] == [*reads, protocol1.sync_write(30, 4, goals)]

@@ -7,7 +7,7 @@ import pytest
 from msgspec.structs import replace
 from tests.kit.campaigns import campaign
 from tests.kit.line_faults import truncate_next
-from tests.kit.rigs import every_servo, make_plan, make_rig, random_fault, start_rig
+from tests.kit.rigs import every_servo, make_plan, make_rig, make_x, random_fault, start_rig
 
 from dxlrun.channels.event_records import EventCode
 from dxlwire.bus_plan import RegisterValue
@@ -45,12 +45,6 @@ FAMILIES = {
 }
 """What the e-Manual's pages of the models say."""
 ENDLESS = {"continuous": True, "lower": -math.inf, "upper": math.inf}
-
-
-def make_pair(**change):
-    """Return a plan of two XM430-W350."""
-    x = {"model": "XM430-W350", "protocol": 2.0, "reference": np.pi, "return_delay_ns": 0}
-    return make_plan((1, 2), **x | change)
 
 
 def make_one(model, protocol, **change):
@@ -141,7 +135,7 @@ def test_what_the_file_declares_holds_in_another_mode_whose_own_values_differ():
     """A change resets gains "properly to the selected Operating Mode" (e-Manual, X series, Operating Mode
     (11)), which does not say to what: here to 400, and more than the manual names."""
     items = find_table("XM430-W350", 2.0).items
-    plan = make_pair()
+    plan = make_x((1, 2))
     declared = tuple(
         RegisterValue(items[name].address, items[name].size, value, name)
         for name, value in (("position_p_gain", items["position_p_gain"].initial), ("led", 1))
@@ -162,8 +156,7 @@ def test_what_the_file_declares_holds_in_another_mode_whose_own_values_differ():
 
 
 def test_joint_of_a_second_bus_changes_its_own_mode():
-    x = {"model": "XM430-W350", "protocol": 2.0, "reference": np.pi, "return_delay_ns": 0}
-    rig = start_rig(make_plan((1,), **x), make_plan((2,), name="other", first_row=1, **x))
+    rig = start_rig(make_x((1,)), make_x((2,), name="other", first_row=1))
     for row in (0, 1):
         change(rig, V, rows=(row,))
     assert rig.servo(2, bus=1).registers["operating_mode"] == 1
@@ -253,26 +246,6 @@ def test_a_servo_that_reboots_in_its_own_mode_change_gets_no_torque_by_that(mode
         assert not servo.torque_on, number
     assert len(rebooted) > 10
     assert sum(map(any, given)) <= 2, "it gets torque only where it reboots after the last check before that"
-
-
-# Limits of the torque
-
-
-def limit_torque(rig, full, share):
-    """Let a policy reduce the torque of all servos."""
-    rig.hardware._full_torque = [[full, full]]
-    rig.hardware.limit_torque(share)
-
-
-def test_a_torque_limit_weakens_a_servo_that_follows_a_pwm_and_does_not_drive_it(arm):
-    change(arm, W)
-    command(arm, W, 0.0)
-    moved(arm, 3)
-    limit_torque(arm, 885, 0.1)
-    assert abs(moved(arm)) < 0.001
-    command(arm, W, 1.0)
-    moved(arm, 2)
-    assert abs(arm.servo(1).registers.ticks("goal_pwm")) == 88
 
 
 FOLLOWED = {

@@ -237,19 +237,6 @@ def armed(rig):
     return rig.registers("bus_watchdog")
 
 
-def trip(servo):
-    """Leave a servo as the reset of a watchdog that heard nothing does."""
-    for name, value in (("profile_velocity", 0), ("profile_acceleration", 0), ("bus_watchdog", -1)):
-        servo.poke(name, value)
-
-
-def move_far(rig):
-    """Begin a slow way of 2 rad."""
-    rig.goals.position[:], rig.goals.velocity[:] = 2.0, 0.2
-    rig.cycles(5)
-    assert 0.1 < abs(rig.buses[0].servos[1].velocity) < 0.25
-
-
 def fastest(rig, servo, count):
     """Return the highest speed of a servo in the next cycles, rad/s."""
     speeds = []
@@ -259,25 +246,25 @@ def fastest(rig, servo, count):
     return max(speeds)
 
 
-class TestWhileOthersAreArmed:
-    """Arming takes an exchange a servo, in which those that are armed hear nothing of a cycle."""
+def test_no_servo_is_taken_for_tripped_before_it_was_armed():
+    """The first states are read again after a pause that is longer than the watchdogs.
 
-    def test_none_is_taken_for_tripped_before_it_was_armed(self):
-        """The first states are read once more after a pause that is longer than the watchdogs."""
-        rig = make_rig(arm(ticks=2))
-        read = rig.hardware.read_states
+    Arming takes an exchange a servo, in which those that are armed hear nothing of a cycle.
+    """
+    rig = make_rig(arm(ticks=2))
+    read = rig.hardware.read_states
 
-        def spoilt():
-            truncate_next(rig.buses[0], 11, 4)
-            rig.hardware.read_states = read
-            read()
+    def spoilt():
+        truncate_next(rig.buses[0], 11, 4)
+        rig.hardware.read_states = read
+        read()
 
-        rig.hardware.read_states = spoilt
-        rig.hardware.start()
-        assert rig.events.of(EventCode.READ_LOST)
-        assert rig.events.of(EventCode.WATCHDOG) == []
-        # goals are followed as fast as they say
-        assert all(map(math.isnan, rig.hardware._servos[0].life.ceiling))
+    rig.hardware.read_states = spoilt
+    rig.hardware.start()
+    assert rig.events.of(EventCode.READ_LOST)
+    assert rig.events.of(EventCode.WATCHDOG) == []
+    # goals are followed as fast as they say
+    assert all(map(math.isnan, rig.hardware._servos[0].life.ceiling))
 
 
 def test_a_process_that_stands_still_again_and_again_before_a_read_shows_no_older_states(started):
@@ -314,7 +301,9 @@ def test_many_are_disarmed_where_torque_stays_on_although_that_takes_longer_than
 
 def test_a_servo_that_is_revived_goes_on_slowly_though_its_profile_was_reset(started):
     servo = started.servo(12)
-    move_far(started)
+    started.goals.position[:], started.goals.velocity[:] = 2.0, 0.2
+    started.cycles(5)
+    assert 0.1 < abs(servo.velocity) < 0.25
     started.wait(300 * MS)
     assert (servo.registers["bus_watchdog"], servo.registers["profile_velocity"]) == (TRIPPED, 0)
     started.goals.velocity[:] = 10.0
@@ -330,7 +319,9 @@ def test_shaft_of_a_lost_servo_returns_slowly_whatever_its_gear_though_its_profi
     rig.cycles(5)
     servo.silence()
     rig.cycles(5)
-    trip(servo)
+    # as the reset of a watchdog that heard nothing leaves it
+    for name, value in (("profile_velocity", 0), ("profile_acceleration", 0), ("bus_watchdog", -1)):
+        servo.poke(name, value)
     servo.silence(False)
     rig.goals.velocity[:] = 10.0 * ratio
     assert fastest(rig, servo, 100) == pytest.approx(RETURN_SPEED, rel=0.1)

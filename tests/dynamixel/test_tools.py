@@ -10,7 +10,7 @@ from tests.kit.servo_cases import CASES
 from tests.kit.tool_cases import RATE, WRITE, ToolCase, ToolRig
 
 from dxlrun.compile.robot_compiler import compile_files
-from dxlrun.dynamixel.tools import scanning, servo_backup
+from dxlrun.dynamixel.tools import servo_backup
 from dxlrun.dynamixel.tools.inspection import identify, read_models
 from dxlrun.dynamixel.tools.scanning import Search, known_rates, scan
 from dxlrun.dynamixel.tools.tool_line import ToolLine
@@ -99,31 +99,12 @@ def test_a_mode_that_is_restored_resets_no_gain_of_the_backup(rig, tmp_path):
     assert servo.registers["position_p_gain"] == 640
 
 
-def two(servo_id, model="XM430-W350"):
-    return ServoConfig(servo_id, model, 2.0)
-
-
-def scanned(line, *ids, protocols=(2.0,), rates=(57_600,)):
-    return scan(ToolLine(line), Search(protocols, rates, ids))
-
-
 def test_a_rate_that_was_tried_is_left_again():
-    line = VirtualLine(two(1))
+    line = VirtualLine(ServoConfig(1, "XM430-W350", 2.0))
     tool = ToolLine(line)
     assert tool.speak(2.0, 57_600)
     assert tool.can_run_at(1_000_000)
     assert line.bus.baud_rate == 57_600
-
-
-def test_one_broadcast_ping_finds_all_servos_of_protocol_2():
-    line = VirtualLine(two(1), two(7, "XL430-W250"), two(252, "XL-320"))
-    found = scanned(line)
-    models = {1: "XM430-W350", 7: "XL430-W250", 252: "XL-320"}
-    assert [(one.servo_id, one.model, one.remarks) for one in found.servos] == [
-        (servo_id, model, ()) for servo_id, model in models.items()
-    ]
-    assert sum(data[4] == 0xFE for data in line.heard) == 1
-    assert {data[7] for data in line.heard} == {1, 2}  # pings and reads: nothing is written
 
 
 @pytest.mark.parametrize("protocol", [1.0, 2.0])
@@ -131,7 +112,7 @@ def test_every_model_is_known_by_its_number_and_can_be_drafted_from(protocol):
     tables = [table for table in all_tables() if table.protocol == protocol]
     servos = [ServoConfig(number, table.model, 0.5) for number, table in enumerate(tables, 1)]
     line = VirtualLine(*servos, protocol=protocol, rate=1_000_000)
-    found = scanned(line, protocols=(protocol,), rates=(1_000_000,)).servos
+    found = scan(ToolLine(line), Search((protocol,), (1_000_000,))).servos
     assert [one.model for one in found] == [table.model for table in tables]
     assert {one.return_delay for one in found} == {500_000}
     assert all(one.position is not None and one.lowest is not None for one in found)
@@ -150,13 +131,6 @@ def test_progress_goes_from_nothing_to_everything():
     scan(ToolLine(VirtualLine()), search, lambda _, share: shares.append(share))
     assert (shares[0], shares[-1]) == (0.0, 1.0)
     assert shares == sorted(shares)
-
-
-def test_few_ids_are_asked_one_by_one():
-    line = VirtualLine(two(3), two(11))
-    found = scanned(line, *range(scanning.FEW))
-    assert [one.servo_id for one in found.servos] == [3, 11]
-    assert all(data[4] != 0xFE for data in line.heard)
 
 
 ROBOT = """

@@ -81,7 +81,7 @@ def make_plan(
             servo_id=servo_id,
             table=find_table(models[index], protocol),
             reference=change.get("reference", MIDDLE),
-            direction=1 if index % 2 else -1,
+            direction=change.get("direction", 1 if index % 2 else -1),
             lower=change.get("lower", -MIDDLE),
             upper=change.get("upper", MIDDLE),
             continuous=change.get("continuous", False),

@@ -20,10 +20,11 @@ from dxlrun.dynamixel.tools.tool_line import ToolLine
 from dxlrun.errors import DxlrunError
 from dxlsim.servo.simulated_servo import SimulatedServo
 from dxlsim.simulation_plan import AdapterConfig, ServoConfig
+from dxlwire.transaction import BROADCAST_ID
 from dxlwire.wire.protocol2 import Reset
 
 RATE = 57_600
-READ, WRITE, FACTORY_RESET = 2, 3, 6
+PING, READ, WRITE, FACTORY_RESET = 1, 2, 3, 6
 
 
 class ToolRig:
@@ -133,8 +134,11 @@ class ToolCase(Case):
         bus = self.tool.line.bus
         bus.after(int(number) - 1, partial(bus.alter_next_instruction, "lost", lambda _: b""))
 
-    def expect_sent(self, count: str, instruction: str) -> None:
-        found = self.tool.sent().count(WRITE if instruction == "write" else FACTORY_RESET)
+    def expect_sent(self, count: str, kind: str) -> None:
+        if kind == "broadcast":
+            found = sum(data[4] == BROADCAST_ID for data in self.tool.line.heard)
+        else:
+            found = self.tool.sent().count(WRITE if kind == "write" else FACTORY_RESET)
         assert found == (0 if count == "no" else int(count)), f"it is {found}"
 
     def expect_rest(self, angle: str, torque: str) -> None:
@@ -176,7 +180,9 @@ STEPS: dict[str, Callable[..., object]] = {
 }
 EXPECTATIONS: dict[str, Callable[..., object]] = {
     r"servo (\d+): (.+)": Case.expect_registers,
-    r"sent: (no|\d+) (write|reset)s?": ToolCase.expect_sent,
-    r"sent: reads alone": lambda case: case.expect_ids(sorted({*case.tool.sent()}), str(READ)),
+    r"sent: (no|\d+) (write|reset|broadcast)s?": ToolCase.expect_sent,
+    r"sent: (pings and )?reads alone": lambda case, pings: case.expect_ids(
+        sorted({*case.tool.sent()}), f"{PING} {READ}" if pings else str(READ)
+    ),
     r"stays at (\S+) rad (with|without) torque": ToolCase.expect_rest,
 }
