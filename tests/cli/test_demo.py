@@ -12,18 +12,19 @@ import dxlrun.cli
 from dxlrun.cli import run as run_room
 from dxlrun.cli import verb_registry
 from dxlrun.cli.inputs import examples_directory
-from dxlrun.plan.robot_plan import Plan
+from dxlrun.compile.robot_compiler import CompiledRobot
 from dxlrun.remote import sockets
 
 
 def test_demo_is_the_first_command_of_the_readme(dxlrun: Dxlrun, monkeypatch: pytest.MonkeyPatch) -> None:
     """tests/test_readme.py runs it; tests/test_suite.py builds the wheel and compares its examples."""
-    plans: list[tuple[Plan, dict[str, Any]]] = []
-    monkeypatch.setattr(run_room, "_run_plan", lambda plan, *_, **options: plans.append((plan, options)) or 0)
+    robots: list[tuple[CompiledRobot, dict[str, Any]]] = []
+    monkeypatch.setattr(run_room, "_run_compiled", lambda one, *_, **how: robots.append((one, how)) or 0)
     said = dxlrun("demo", "--virtual")
     assert (said.code, said.err) == (0, "")
-    ((plan, options),) = plans
+    ((robot, options),) = robots
     assert options["virtual"]
+    plan = robot.plan
     assert (plan.robot, plan.loop.end_ns) == ("bioloid_torso", 35_000_000_000)
     assert {one.controller for one in plan.loop.commands} == {"head", "left_arm", "right_arm"}
     files = [str(examples_directory() / name) for name in run_room.DEMO]
@@ -42,7 +43,7 @@ def test_page_is_served_during_the_run_where_it_is_installed(
         return 7
 
     monkeypatch.setattr(subprocess, "Popen", start)
-    monkeypatch.setattr(run_room, "_run_plan", run)
+    monkeypatch.setattr(run_room, "_run_compiled", run)
     monkeypatch.setattr(verb_registry, "packaged", lambda: {"view": object()})
     monkeypatch.setattr(sockets, "running", lambda: ("other",))
     assert run_room.demo(**options) == 7
@@ -53,7 +54,7 @@ def test_page_is_served_during_the_run_where_it_is_installed(
 def test_demo_without_the_page_names_the_package(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(run_room, "_run_plan", lambda *_, **__: 0)
+    monkeypatch.setattr(run_room, "_run_compiled", lambda *_, **__: 0)
     monkeypatch.setattr(verb_registry, "packaged", dict)
     assert run_room.demo() == 0
     assert "install dxlrun-view" in capsys.readouterr().out

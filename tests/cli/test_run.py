@@ -31,6 +31,7 @@ from dxlrun.channels.event_records import (
     GoalTotals,
     Severity,
 )
+from dxlrun.control.controllers.plugin_loading import load_plugins
 from dxlrun.log.log_reader import read_log
 from dxlrun.plan.machine_load import MachineLoad, SimulationWait
 from dxlrun.run.run_summary import RunOptions, RunStatusLine, RunSummary, run_verdict
@@ -455,7 +456,9 @@ def test_run_on_virtual_time_shows_its_progress(torso: Path, monkeypatch: pytest
     monkeypatch.setattr("dxlrun.run.run_summary._REFRESH_S", 0.0)
     console, line = Console(file=io.StringIO()), Line()
     monkeypatch.setattr(console, "status", lambda _: nullcontext(line))
-    run_virtual(plan_of(torso, duration_s=0.2), RunOptions(record=False), console)
+    # The run uses the plug-ins that were loaded to compile it.
+    monkeypatch.delattr("dxlrun.run.virtual_run.load_plugins")
+    run_virtual(plan_of(torso, duration_s=0.2), load_plugins(), RunOptions(record=False), console)
     assert len(line.shown) == 10
     assert re.fullmatch(r"bioloid_torso: 0\.2 of 0\.2 s, .* x, 0 periods skipped \(.*", line.shown[-1])
 

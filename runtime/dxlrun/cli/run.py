@@ -31,6 +31,7 @@ from dxlrun.output.unblocked import leave_real_time, unblocked
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from dxlrun.compile.robot_compiler import CompiledRobot
     from dxlrun.plan.recording_plan import RecordingPlan
     from dxlrun.plan.robot_plan import Plan
     from dxlrun.run.run_summary import RunOptions, RunSummary
@@ -131,10 +132,10 @@ def run(
         gateway=gateway,
         listen=listen or "",
     )
-    return _run_plan(result.plan, options, virtual=virtual)
+    return _run_compiled(result, options, virtual=virtual)
 
 
-def _run_plan(plan: Plan, options: RunOptions, *, virtual: bool) -> int:
+def _run_compiled(robot: CompiledRobot, options: RunOptions, *, virtual: bool) -> int:
     """Run a compiled robot and print the result; return the exit code. Raises InputError without Linux."""
     console = out()
     if not virtual and sys.platform != "linux":
@@ -145,12 +146,12 @@ def _run_plan(plan: Plan, options: RunOptions, *, virtual: bool) -> int:
     if virtual:
         from dxlrun.run.virtual_run import run_virtual
 
-        summary = run_virtual(plan, options, console)
+        summary = run_virtual(robot.plan, robot.plugins, options, console)
     else:
         from dxlrun.run.supervisor import run_robot
 
-        summary = run_robot(plan, options, console)
-    return show_summary(summary, plan, console)
+        summary = run_robot(robot.plan, options, console)
+    return show_summary(summary, robot.plan, console)
 
 
 @unblocked()
@@ -171,9 +172,9 @@ def demo(*, page: PageFlag = True, virtual: Flag = False, debug: DebugFlag = Fal
 
     leave_real_time()
     # Warnings about the robot file are for its author, not for the user of the demo.
-    plan = compiled(robot, (), (motion,), None).plan
+    result = compiled(robot, (), (motion,), None)
     with _page_beside(shown=page and not virtual):
-        return _run_plan(plan, RunOptions(debug=debug), virtual=virtual)
+        return _run_compiled(result, RunOptions(debug=debug), virtual=virtual)
 
 
 @contextmanager

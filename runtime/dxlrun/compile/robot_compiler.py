@@ -34,7 +34,7 @@ from dxlrun.compile.orientations import check_orientations
 from dxlrun.compile.policies import compile_policies, compile_poses
 from dxlrun.compile.problems import RobotFile
 from dxlrun.compile.simulation import compile_simulation
-from dxlrun.control.controllers.plugin_loading import load_plugins
+from dxlrun.control.controllers.plugin_loading import PlugIns, load_plugins
 from dxlrun.description.joints.groups import NO_GROUPS, Groups
 from dxlrun.description.joints.joint_forms import Joint
 from dxlrun.description.reading import Description, Replacement, read_robot
@@ -63,6 +63,7 @@ class CompiledRobot(msgspec.Struct, frozen=True):
     """Result of a compilation: the plan of a run, the compiled joints and motions, and the warnings."""
 
     plan: Plan
+    plugins: PlugIns  # as loaded to compile it, for a run in this process
     warnings: tuple[Problem, ...]
     rate: float  # rate of the loop in the file, Hz
     joints: tuple[CompiledJoint, ...]
@@ -263,7 +264,9 @@ def compile_robot(
         | _packages(features),
         mechanics=mechanics,
     )
-    return CompiledRobot(plan, file.warnings, settings.rate, tuple(joints.values()), tuple(parts), shown)
+    return CompiledRobot(
+        plan, plugins, file.warnings, settings.rate, tuple(joints.values()), tuple(parts), shown
+    )
 
 
 def _models(buses: Iterable[BusPlan]) -> frozenset[str]:

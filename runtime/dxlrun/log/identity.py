@@ -118,8 +118,12 @@ _imported = cache(code_hashes)
 """`code_hashes`, computed once per process, because a process imports its code only once."""
 
 
-def module_files(module: str) -> list[tuple[str, Path]]:
-    """Return the files of a Python package or module, by path relative to its parent; empty if not found."""
+def module_files(module: str) -> list[tuple[str, str]]:
+    """Return the files of a Python package or module; empty if not found.
+
+    Each has its path relative to the module's parent, and its path. They are strings, because a `Path` takes
+    ten times as long, and dxlrun has hundreds of files.
+    """
     try:
         spec = find_spec(module)
     # ValueError: the module was created in memory.
@@ -127,29 +131,28 @@ def module_files(module: str) -> list[tuple[str, Path]]:
         return []
     if spec is None:
         return []
-    places = [Path(place) for place in spec.submodule_search_locations or [spec.origin or ""]]
-    return sorted(_named(places))
+    return sorted(_named(spec.submodule_search_locations or [spec.origin or ""]))
 
 
-def _named(places: Iterable[Path]) -> Iterator[tuple[str, Path]]:
+def _named(places: Iterable[str]) -> Iterator[tuple[str, str]]:
     for place in places:
-        if place.is_file():
-            yield place.name, place
+        if os.path.isfile(place):
+            yield os.path.basename(place), place
             continue
         for folder, folders, files in os.walk(place):
             folders[:] = [name for name in folders if name != "__pycache__"]
-            below = Path(folder).relative_to(place.parent).as_posix()
+            below = Path(folder).relative_to(Path(place).parent).as_posix()
             for name in files:
-                # Strings, because a path takes ten times as long, and dxlrun has hundreds of files.
                 path = os.path.join(folder, name)
                 if not name.endswith(".pyc") and os.path.isfile(path):
-                    yield f"{below}/{name}", Path(path)
+                    yield f"{below}/{name}", path
 
 
-def _hash_of(path: Path) -> str:
+def _hash_of(path: str) -> str:
     """Return the SHA-256 of a file, or `not readable: REASON`."""
     try:
-        return sha256(path.read_bytes()).hexdigest()
+        with open(path, "rb") as file:
+            return sha256(file.read()).hexdigest()
     except OSError as error:
         return f"not readable: {error.strerror}"
 

@@ -9,7 +9,11 @@ from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
 
+import mcap
 import msgspec
+import numpy as np
+import pluggy
+import pydantic
 from msgspec.structs import replace
 
 from dxlrun.channels.kept import KeptStates
@@ -23,7 +27,8 @@ from dxlrun.plan.recording_plan import PART_PATTERN, RecordingPlan
 from dxlrun.plan.robot_plan import Plan, to_json
 from dxlwire.port.latency_timer import is_simulated
 
-_LIBRARIES = ("dxlrun", "mcap", "msgspec", "numpy", "pluggy", "pydantic")
+_LIBRARIES = (mcap, msgspec, np, pluggy, pydantic)
+"""Libraries whose versions are in the log. The metadata of their packages would take long to parse."""
 
 
 def log_header(
@@ -53,8 +58,12 @@ def log_header(
                 **{f"argument {name}": value for name, value in plan.arguments.items()},
             },
             IDENTITY_NAME: identity(plan.source_file, _files(plan), plan.packages),
-            "versions": {"python": sys.version.split()[0], "contract": str(CONTRACT_VERSION)}
-            | {name: version(name) for name in _LIBRARIES},
+            "versions": {
+                "python": sys.version.split()[0],
+                "contract": str(CONTRACT_VERSION),
+                "dxlrun": version("dxlrun"),
+                **{library.__name__: library.__version__ for library in _LIBRARIES},
+            },
             "plugins": {controller.type: controller.distribution for controller in plan.loop.controllers},
             "kernel": {"system": machine.system, "release": machine.release, "version": machine.version}
             | {"machine": machine.machine},

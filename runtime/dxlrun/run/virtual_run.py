@@ -61,6 +61,7 @@ class VirtualRobot:
 
     Args:
         plan: The robot.
+        plugins: Plug-ins that this process has loaded; None: they are loaded here.
         log: Path of the log; None: no log.
         take_over: The servos may have torque already.
         ledger: Record of the simulated buses' traffic, closed with the log; None: a ledger in memory.
@@ -75,6 +76,7 @@ class VirtualRobot:
     def __init__(
         self,
         plan: Plan,
+        plugins: PlugIns | None = None,
         *,
         log: Path | None = None,
         take_over: bool = False,
@@ -94,7 +96,8 @@ class VirtualRobot:
         """Simulated buses, in the order of the plan's buses; faults are injected here."""
         if simulated.sensed is not None:
             fix_to_links((one for bus in self.buses for one in bus.devices), mechanics, simulated.sensed)
-        plugins = load_plugins(files=plan.included)
+        if plugins is None:
+            plugins = load_plugins(files=plan.included)
         with ExitStack() as opened:
             slots = self._open_sources(plugins, mechanics, opened)
             self.stop = StopFlag()
@@ -248,14 +251,14 @@ def _stop(stop: StopFlag) -> None:
     stop.request()
 
 
-def run_virtual(plan: Plan, options: RunOptions, out: Console) -> RunSummary:
+def run_virtual(plan: Plan, plugins: PlugIns, options: RunOptions, out: Console) -> RunSummary:
     """Run a plan in virtual time for the command line; the log has the times of the virtual clock."""
     log = new_log(plan.recording, plan.robot) if options.record else None
     try:
         # A run at the command line needs no ledger in memory, which would grow without bound.
         ledger = open_ledger(options.ledger)
         kept = state_directory(plan)
-        robot = VirtualRobot(plan, log=log, take_over=options.take_over, ledger=ledger, kept=kept)
+        robot = VirtualRobot(plan, plugins, log=log, take_over=options.take_over, ledger=ledger, kept=kept)
     except BaseException:
         if log:
             discard_log(log)

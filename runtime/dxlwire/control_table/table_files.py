@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import math
 import tomllib
-from collections import ChainMap
 from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -95,7 +94,9 @@ def _listing(name: str, heads: Mapping[str, Entry], parsed: Callable[[str], Entr
     """Return one model from the keys at the start of its files. Whole files are parsed when the table is
     built."""
     chain = _chain(name, heads)
-    head = dict(ChainMap(*(dict(heads[each]) for each in chain)))
+    head: dict[str, object] = {}
+    for each in reversed(chain):
+        head |= heads[each]
     return Listing(
         names=(str(head["model"]), *words(heads[name].get("aliases", []))),
         model_number=whole(head, "model_number"),
