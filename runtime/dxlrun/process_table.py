@@ -23,6 +23,7 @@ _ROLES = {
     b"dxlrun.log.recorder": "recorder",
     b"dxlrun.remote": "gateway",
 }
+_UNSTEERED = {b"--virtual", b"--no-gateway"}
 KIND = "--kind"
 """Command-line argument of a feature's process; the next argument is its role."""
 
@@ -132,6 +133,18 @@ def found_runs() -> list[FoundRun]:
     return sorted(FoundRun(robot, members, _directory(members[0].pid)) for robot, members in found if members)
 
 
+def start_directories() -> set[str]:
+    """Return XDG_RUNTIME_DIR of each process that reads a robot file for a run, and so has no plan yet."""
+    found = set()
+    for folder in PROC.iterdir():
+        if not folder.name.isdigit() or not _reads_robot_file(folder):
+            continue
+        stat = read_stat(folder)
+        if stat is not None and not stat.is_dead and not stat.is_stopped and robot_of(folder) is None:
+            found.add(_directory(int(folder.name)))
+    return found
+
+
 def _members(processes: list[RunProcess]) -> Iterator[RunProcess]:
     """Yield the processes that belong to a run, with their roles; others only share its memory."""
     parents = {one.stat.parent for one in processes}
@@ -189,3 +202,11 @@ def _role(process: Path) -> str:
 
 def _executes_dxlrun(process: Path) -> bool:
     return any(os.path.basename(word) == b"dxlrun" for word in _words(process)[:3])
+
+
+def _reads_robot_file(process: Path) -> bool:
+    """Return whether a command line is `dxlrun ROBOT.yaml`, of a run that clients can steer."""
+    words = _words(process)
+    names = [os.path.basename(word) for word in words[:3]]
+    file = words[names.index(b"dxlrun") + 1 :][:1] if b"dxlrun" in names else []
+    return any(one.endswith((b".yaml", b".yml")) for one in file) and not _UNSTEERED & {*words}

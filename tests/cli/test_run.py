@@ -132,7 +132,11 @@ def totals(group: EventGroup) -> EventTotals:
         ({"events": totals(EXPIRED)}, 0, ["done: at 0.1 s no client is there; ran for 2.0 s.", KEPT]),
         ({"events": totals(FAULT)}, 1, ["ran for 2.0 s.", "head: head: nan."]),
         (
-            {"events": EventTotals(goals=GoalTotals({"accepted": 3, "reached": 1, "cancelled": 1}))},
+            {
+                "events": EventTotals(
+                    goals=GoalTotals({"accepted": 4, "reached": 1, "cancelled": 1, "refused": 1})
+                )
+            },
             0,
             ["1 of 2 goals reached.", KEPT],
         ),

@@ -2,18 +2,20 @@
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from tests.kit.awaited import DEADLINE_S
 from tests.kit.commands import Dxlrun
 
 from dxlrun.channels.heartbeat import GatewayAvailability, Phase
-from dxlrun.remote.sockets import create_listener
+from dxlrun.remote.sockets import await_sockets, create_listener
 from dxlrun.run.unsteered import unsteered_runs
 
 Begin = Callable[..., subprocess.Popen[str]]
@@ -37,6 +39,12 @@ source += "print('ready', flush=True); sys.stdin.read()"
 loop = [sys.executable, "-c", source, "dxlrun.run.loop_process"]
 sys.exit(subprocess.Popen(loop, stdin=subprocess.PIPE, pass_fds=[plan]).wait())  # it ends with this process
 """
+EARLY = """\
+import signal
+print("ready", flush=True)
+while True:
+    signal.pause()
+"""
 LOST = "it has no supervisor and no guardian and no gateway"
 
 
@@ -52,7 +60,7 @@ def begin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Begin]:
             for name, value in {"ROBOT": robot, **values}.items():
                 source = source.replace(name, str(value))
             program.write_text(source)
-            command = [program] if values else ["-c", source, "dxlrun.run.loop_process"]
+            command = [program, "arm.yaml"] if values else ["-c", source, "dxlrun.run.loop_process"]
             child = subprocess.Popen([sys.executable, *command], stdout=subprocess.PIPE, text=True)
             stack.enter_context(child)
             stack.callback(child.kill)
@@ -95,6 +103,32 @@ def test_only_a_run_without_a_gateway_gets_the_advice_to_stop_it(
     err = dxlrun("list").err
     assert err.startswith(f"dxlrun: young_arm {said}")
     assert ("dxlrun stop" in err) == ("dxlrun stop" in said)
+
+
+@pytest.mark.parametrize("early", [True, False])
+@pytest.mark.parametrize("ends", [True, False])
+def test_client_waits_while_a_robot_starts(
+    begin: Begin, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, *, early: bool, ends: bool
+) -> None:
+    """Early: the process still reads the robot file, so the robot's name is not known yet."""
+    awaited = {"PHASE": int(Phase.LOADING), "STEERING": int(GatewayAvailability.AWAITED)}
+    child = begin("young_arm", EARLY if early else SUPERVISOR, **awaited)
+    waits = []
+
+    def sleep(_: float) -> None:
+        waits.append("slept")
+        if ends:
+            child.kill()
+            child.wait(DEADLINE_S)
+        else:
+            listeners.append(create_listener("young_arm")[0])
+
+    listeners: list[socket.socket] = []
+    monkeypatch.setattr("dxlrun.remote.sockets.time", SimpleNamespace(sleep=sleep))
+    found = await_sockets("young_arm")
+    assert ([*found], waits) == ([] if ends else ["young_arm"], ["slept"])
+    for each in listeners:
+        each.close()
 
 
 @pytest.mark.parametrize("stopped", ["loop", "supervisor"])

@@ -11,7 +11,7 @@ import pytest
 from tests.kit.loops import PERIOD_NS, Hardware, Robot
 
 from dxlrun.channels.cycle import Torque
-from dxlrun.channels.event_records import EventCode, GoalReport
+from dxlrun.channels.event_records import EventCode, GoalHistory, GoalReport
 from dxlrun.contract.controller import CommandModel, Controller, Interfaces, Outcome, ParametersModel
 from dxlrun.control.controllers.goal_registry import KEPT, GoalStatus
 from dxlrun.control.controllers.published_topics import TopicLog
@@ -94,6 +94,17 @@ class Story(Robot):
 @pytest.fixture
 def story():
     return Story()
+
+
+def test_refused_goal_of_a_client_does_not_count(story):
+    story.mover.on_goal = lambda self, goal, data, time_ns: goal.end(Outcome.ABORTED, "out of reach")
+    story.run(3, {1: story.moves(3)})
+    for origin, asked in (("a client", 0), ("motion.yaml:7:5", 1)):
+        history = GoalHistory()
+        history.planned = {"motion.yaml:7:5"}
+        for _, report in story.reports:
+            history.count_report(msgspec.structs.replace(report, origin=origin))
+        assert history.totals.asked == asked
 
 
 def test_deactivation_aborts_the_goal_and_a_result_that_comes_later_counts_no_more(story):

@@ -47,6 +47,7 @@ def asked(sent):
 def test_the_difference_is_a_table_and_nothing_is_written(check):
     code, out, err, sent = check("position_p_gain: 900, return_delay_time: 0 us", "--debug")
     table = [line.split() for line in out[out.index("Registers") :].splitlines()]
+    assert out.startswith("pair: the servos differ from the file. 2 joints")
     assert ["elbow", "return_delay_time", "EEPROM", "9", "0", "0", "leave", "it"] in table
     assert ["elbow", "position_p_gain", "RAM", "84", "900", "800", "write", "it"] in table
     assert ["wrist", "led", "RAM", "65", "1", "0", "write", "it"] in table
@@ -58,7 +59,17 @@ def test_the_difference_is_a_table_and_nothing_is_written(check):
 def test_servos_that_are_as_declared_are_counted(check):
     code, out, err, _ = check("position_p_gain: 800", "wrist_led:=0")
     assert "2 servos compared with the file, no differences\n" in out
+    assert out.startswith("pair: good. 2 joints")
     assert (code, err) == (0, "")
+
+
+def test_robot_whose_servos_do_not_answer_is_not_good(check):
+    code, out, err, _ = check(
+        "position_p_gain: 800", ids=(3,), robot_text=ROBOT.replace("auto", "XM430-W350")
+    )
+    assert (code, out.split(". ")[0]) == (1, "pair: a run would not start")
+    assert "no servo compared with the file; a run would not start\n" in out
+    assert "none of the 2 servos on bus main answers" in err
 
 
 def test_each_servo_of_a_joint_is_counted(check):

@@ -185,6 +185,8 @@ class GoalReport(msgspec.Struct, frozen=True):
     """Joint with the largest error at the end; empty: none."""
     error: float | None = None
     """Distance of that joint from its target, rad or m; None: not known."""
+    refused: bool = False
+    """True if the controller aborted the goal before it began, so that its client got a refusal."""
 
     @property
     def cut(self) -> bool:
@@ -221,10 +223,10 @@ class GoalTotals(msgspec.Struct, frozen=True):
 
     @property
     def asked(self) -> int:
-        """Number of goals that were accepted and neither cancelled nor replaced by another goal."""
+        """Number of accepted goals that were not cancelled, replaced by another, or refused to a client."""
         counts = self.counts
-        withdrawn = counts.get("preempted", 0) + counts.get("cancelled", 0)
-        return counts.get("accepted", 0) - withdrawn
+        withdrawn = (counts.get(each, 0) for each in ("preempted", "cancelled", "refused"))
+        return counts.get("accepted", 0) - sum(withdrawn)
 
     @property
     def reached(self) -> int:
@@ -251,6 +253,7 @@ class GoalHistory:
         """Count a goal's event by its status, and store a failed goal, up to MOST_FAILED."""
         planned = report.origin in self.planned
         self._counts[report.status] += 1
+        self._counts["refused"] += report.refused and not planned
         if report.status == "accepted" and planned:
             self._begun[report.origin] += 1
         if report.status == "reached" and report.joint and report.error is not None:

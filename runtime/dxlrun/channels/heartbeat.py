@@ -13,13 +13,14 @@ after the preceding beat. Otherwise the guardian would apply the shorter timeout
 
 from __future__ import annotations
 
+import os
 from contextlib import suppress
 from enum import IntEnum, unique
 from pathlib import Path
 
 from dxlrun.channels import shared_memory
 from dxlrun.channels.shared_memory import load, store
-from dxlrun.process_table import read_stat
+from dxlrun.process_table import SUPERVISOR, FoundRun, read_stat
 
 _PHASE, _BEATS, _CYCLE, _SKIPPED, _LOOKS, _CYCLE_NS, _CALL, _SUPERVISOR_LOOKS, _STEERING = range(9)
 _NAMES = 4096  # offset of the names of controllers, in bytes
@@ -43,6 +44,9 @@ class Phase(IntEnum):
     STOPPING = 4
     DONE = 5
     """The loop has left the robot according to its policy: limp, if servos replied, or holding."""
+
+
+_ENDING = (Phase.STOPPING, Phase.DONE)
 
 
 @unique
@@ -76,6 +80,40 @@ class ControllerMethod(IntEnum):
 
     def __str__(self) -> str:
         return "__init__" if self is ControllerMethod.INIT else self.name.lower()
+
+
+def read_heartbeat(run: FoundRun) -> Heartbeat | None:
+    """Map the heartbeat page of a run; return None if the run has none (yet, or any more)."""
+    # The process may just have exited.
+    with suppress(OSError, ValueError):
+        if path := run.memory("heartbeat"):
+            descriptor = os.open(path, os.O_RDWR)
+            try:
+                return Heartbeat(descriptor)
+            finally:
+                os.close(descriptor)
+    return None
+
+
+def is_ending(run: FoundRun) -> bool:
+    """Return whether the loop is stopping the robot, has stopped it, or has died."""
+    heartbeat = read_heartbeat(run)
+    if heartbeat is None:
+        return False
+    phase = heartbeat.phase
+    return phase in _ENDING or (phase is not Phase.LOADING and run.process("loop") is None)
+
+
+def is_starting(run: FoundRun) -> bool:
+    """Return whether a run will accept commands soon: its supervisor responds, and its loop or its gateway is
+    not ready yet.
+    """
+    supervisor, heartbeat = run.process(SUPERVISOR), read_heartbeat(run)
+    if supervisor is None or supervisor.stat.is_stopped or is_ending(run):
+        return False
+    if heartbeat is None or heartbeat.phase is not Phase.RUNNING:
+        return True
+    return heartbeat.steering is GatewayAvailability.AWAITED
 
 
 def create() -> int:

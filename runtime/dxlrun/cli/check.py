@@ -85,9 +85,9 @@ def check_robot(
         show_json(_as_json(result, found), code=code, errors=problems, warnings=[*result.warnings, *remarks])
         return code
     if graph is None:
-        show_parts(_verdict(result), *_tables(result))
+        show_parts(_verdict(result, found), *_tables(result))
     else:
-        show_parts(_verdict(result), *(f"the controller graph is in {file}" for file in graph))
+        show_parts(_verdict(result, found), *(f"the controller graph is in {file}" for file in graph))
         if not graph:
             show_parts(result.drawing)
     if found is not None:
@@ -148,14 +148,17 @@ def _as_json(result: CompiledRobot, found: InspectionResult | None) -> dict[str,
     return report
 
 
-def _verdict(result: CompiledRobot) -> str:
+def _verdict(result: CompiledRobot, found: InspectionResult | None) -> str:
     """Return the line that a valid file gets: numbers of joints, controllers and warnings, and the rate."""
+    verdict = "good"
+    if found is not None and not found.as_declared:
+        verdict = "a run would not start" if found.problems else "the servos differ from the file"
     loop, warnings = result.plan.loop, len(result.warnings)
     active = sum(controller.active for controller in loop.controllers)
     joints = counted(len(loop.joints), "joint", "joints")
     controllers = counted(len(loop.controllers), "controller", "controllers")
     return (
-        f"{result.plan.robot}: good. {joints}, {active} of {controllers} active, {result.rate:g} Hz, "
+        f"{result.plan.robot}: {verdict}. {joints}, {active} of {controllers} active, {result.rate:g} Hz, "
         f"{warnings or 'no'} warning{'s' * (warnings != 1)}"
     )
 
@@ -190,7 +193,7 @@ def _named(kind: Kind, **keys: str) -> Iterator[tuple[Column, str]]:
 
 _POLICIES: Columns[PolicyRow] = [
     *_named("name", policy="name"),
-    *_named("text", does="does", **{"when the loop has exited": "without_loop"}),
+    *_named("text", does="does", **{"loop gone": "without_loop"}),
     (Column("at most", form="{:.1f} s"), lambda row: row.longest or None),
 ]
 _MOTIONS: Columns[Row] = [
@@ -320,6 +323,8 @@ def _compared(found: InspectionResult) -> str:
     """Return the line after a comparison with the servos: numbers of servos and differences."""
     differing = sum(row.found not in (None, row.declared) for row in found.registers)
     count = differing + len(found.deviations) + len(found.remarks)
+    if not found.compared:
+        return "no servo compared with the file; a run would not start"
     differences = counted(count, "difference", "differences") if count else "no differences"
     start = "; a run would not start" if found.problems else ""
     return f"{counted(found.compared, 'servo', 'servos')} compared with the file, {differences}{start}"

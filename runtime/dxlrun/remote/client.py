@@ -33,7 +33,7 @@ from dxlrun.remote.requests import replies
 from dxlrun.remote.requests import request_table as requests
 from dxlrun.remote.requests.replies import GoalState, NotDone, Parameter, TopicState
 from dxlrun.remote.requests.request_table import Answer, Body, NewMotion, NewValues, Request, Row, Value
-from dxlrun.remote.sockets import MOST_BYTES, Address, RobotLink, SocketLink, sockets
+from dxlrun.remote.sockets import MOST_BYTES, Address, RobotLink, SocketLink, await_sockets, sockets
 
 if TYPE_CHECKING:
     from dxlrun.description.frames.tree import FrameTree
@@ -88,7 +88,7 @@ Executed: TypeAlias = replies.Executed[RemoteGoal]
 
 
 def connect(robot: str | None = None, client: str | None = None) -> RemoteRobot:
-    """Connect to a running robot.
+    """Connect to a running robot; wait until it runs if it is starting on this computer.
 
     Args:
         robot: Name of the robot; None: the only robot that runs on this computer. `NAME@HOST:PORT`, or a name
@@ -98,11 +98,12 @@ def connect(robot: str | None = None, client: str | None = None) -> RemoteRobot:
     Raises:
         DxlrunError: The robot does not run, or several robots run and none was named.
     """
-    found, client = sockets(), client or f"python {os.getpid()}"
-    if robot is not None and robot not in found:
+    client = client or f"python {os.getpid()}"
+    if robot is not None and robot not in sockets():
         address = Address.parse(robot) if "@" in robot else known_robots().get(robot)
         if address is not None:
             return RemoteRobot(robot, NetworkLink(address, client))
+    found = await_sockets(robot)
     names = ", ".join(sorted(found))
     if robot is None:
         if not found:

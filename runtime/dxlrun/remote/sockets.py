@@ -38,6 +38,7 @@ _ENDING_S = 1.0
 """Time, s, within which a gateway that closed a connection at the end of a run removes its socket."""
 LONGEST_PATH = 107
 """Longest path of a Unix socket on Linux, bytes without the terminating zero (unix(7))."""
+_START_POLL_S = 0.05
 
 
 def sockets_directory(runtime_directory: str | None = None) -> Path:
@@ -156,6 +157,33 @@ def sockets() -> dict[str, Path]:
             elif path.is_socket():
                 path.unlink(missing_ok=True)
     return found
+
+
+def await_sockets(robot: str | None) -> dict[str, Path]:
+    """Return `sockets()`; wait first while a robot starts that is not among them yet.
+
+    Args:
+        robot: Name of the robot; None: any robot.
+    """
+    found = sockets()
+    while not (found if robot is None else robot in found):
+        if not _is_starting(robot):
+            return sockets()  # a run that is not starting any more may run by now
+        time.sleep(_START_POLL_S)
+        found = sockets()
+    return found
+
+
+def _is_starting(robot: str | None) -> bool:
+    # Imported here because a running robot is found without it.
+    from dxlrun.channels.heartbeat import is_starting
+    from dxlrun.process_table import found_runs, start_directories
+
+    ours = sockets_directory()
+    return any(sockets_directory(each) == ours for each in start_directories()) or any(
+        robot in (None, run.robot) and sockets_directory(run.runtime_directory) == ours and is_starting(run)
+        for run in found_runs()
+    )
 
 
 class Address(NamedTuple):

@@ -12,7 +12,7 @@ import time
 from contextlib import suppress
 from dataclasses import dataclass
 
-from dxlrun.channels.heartbeat import GatewayAvailability, Heartbeat, Phase
+from dxlrun.channels.heartbeat import GatewayAvailability, Phase, is_ending, is_starting, read_heartbeat
 from dxlrun.errors import DxlrunError
 from dxlrun.process_table import SUPERVISOR, FoundRun, RunProcess, found_runs, is_alive
 from dxlrun.remote.sockets import listener, sockets, sockets_directory
@@ -20,7 +20,6 @@ from dxlrun.remote.sockets import listener, sockets, sockets_directory
 _END_S = 30.0
 """Timeout for the steps of on_exit and the recorder on a slow disk."""
 _POLL_S = 0.05
-_ENDING = (Phase.STOPPING, Phase.DONE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,9 +68,9 @@ def describe_run(run: UnsteeredRun) -> str:
     if run.problem:
         fix = f"end it by `dxlrun stop --robot {run.name}`"
         return f"{run.name} runs but cannot be steered: {run.problem}; {fix}"
-    if _is_ending(run.run):
-        return f"{run.name} is ending"
-    return f"{run.name} is starting; try again when it runs"
+    return (
+        f"{run.name} is starting; try again when it runs" if is_starting(run.run) else f"{run.name} is ending"
+    )
 
 
 def end_run(unsteered: UnsteeredRun, *, wait: bool) -> str:
@@ -83,7 +82,7 @@ def end_run(unsteered: UnsteeredRun, *, wait: bool) -> str:
     # A supervisor cuts torque at its second signal, and Ctrl-C may have been the first. The loop accepts any
     # number of signals, unless it has finished and is about to exit.
     asked = run.process("loop") or run.process(SUPERVISOR)
-    if asked is not None and not _is_ending(run):
+    if asked is not None and not is_ending(run):
         _send(asked, signal.SIGTERM)
     for one in run.processes:
         if one.stat.is_stopped:
@@ -108,7 +107,7 @@ def _problem(run: FoundRun) -> str:
     if supervisor is not None and not supervisor.stat.is_stopped:
         if gateway is not None and gateway.stat.is_stopped:
             return f"its {gateway} is stopped"
-        heartbeat = _heartbeat(run)
+        heartbeat = read_heartbeat(run)
         if heartbeat is None or heartbeat.phase is not Phase.RUNNING:
             return ""
         return "it has no gateway" if heartbeat.steering is GatewayAvailability.IMPOSSIBLE else ""
@@ -123,31 +122,10 @@ def _problem(run: FoundRun) -> str:
 
 
 def _is_steerable(run: FoundRun) -> bool:
-    heartbeat = _heartbeat(run)
+    heartbeat = read_heartbeat(run)
     if heartbeat is None or run.process("gateway") is None:
         return False
     return heartbeat.phase is Phase.RUNNING and heartbeat.steering is GatewayAvailability.POSSIBLE
-
-
-def _is_ending(run: FoundRun) -> bool:
-    """Return whether the loop is stopping the robot, has stopped it, or has died."""
-    heartbeat = _heartbeat(run)
-    if heartbeat is None:
-        return False
-    phase = heartbeat.phase
-    return phase in _ENDING or (phase is not Phase.LOADING and run.process("loop") is None)
-
-
-def _heartbeat(run: FoundRun) -> Heartbeat | None:
-    # The process may just have exited.
-    with suppress(OSError, ValueError):
-        if path := run.memory("heartbeat"):
-            descriptor = os.open(path, os.O_RDWR)
-            try:
-                return Heartbeat(descriptor)
-            finally:
-                os.close(descriptor)
-    return None
 
 
 def _is_ours(run: FoundRun) -> bool:

@@ -17,7 +17,7 @@ from cyclopts import Parameter
 from dxlrun.cli.inputs import DebugFlag, GraphFile, Hertz, JsonFlag, WaitFlag
 from dxlrun.errors import DxlrunError, InputError, suggestion
 from dxlrun.output.quantity import names_with_units, quantity_text
-from dxlrun.output.terminal import print_error, show_json, show_parts
+from dxlrun.output.terminal import err, print_error, show_json, show_parts
 from dxlrun.output.text_table import Column, Columns, Table
 
 if TYPE_CHECKING:
@@ -241,6 +241,9 @@ def load_controller(
 
     entry = WrittenEntry.from_words(words, file, example="type=joint_group_position_controller").data
     if "type" not in entry:
+        if name.endswith((".yaml", ".yml")):
+            fix = f"write `dxlrun play {name}` for a motion, or `NAME --file {name}` for a controller"
+            raise InputError(f"{name} is a file, not the name of a controller; {fix}")
         raise InputError(f"{name} has no type; give one, such as type=joint_group_position_controller")
     with connect_robot(chosen.robot, "load") as robot:
         done = robot.load(name, entry)
@@ -303,7 +306,7 @@ def unsteered_of(name: str | None) -> UnsteeredRun | None:
 
 
 def connect_robot(name: str | None, verb: str) -> RemoteRobot:
-    """Connect to the robot that `--robot` names, or to the only one that runs.
+    """Connect to the robot that `--robot` names, or to the only one that runs; wait while it starts.
 
     Args:
         name: None when the option was not given.
@@ -315,11 +318,14 @@ def connect_robot(name: str | None, verb: str) -> RemoteRobot:
     """
     from dxlrun.remote.client import connect
     from dxlrun.remote.network.network_link import known_robots
-    from dxlrun.remote.sockets import running
+    from dxlrun.remote.sockets import await_sockets, running
     from dxlrun.run.unsteered import describe_run
 
-    names = running()
-    known = names if name is None else (*names, *known_robots())
+    names, remote = running(), () if name is None else known_robots()
+    if not (names if name is None else name in (*names, *remote) or "@" in name):
+        with err().status(f"waiting for {name or 'a robot'}, if it is starting"):
+            names = tuple(sorted(await_sockets(name)))
+    known = (*names, *remote)
     missing = name not in known if name else not names
     if missing and (run := unsteered_of(name)) is not None:
         raise DxlrunError(describe_run(run))

@@ -64,6 +64,7 @@ class WrittenEntry:
             pairs = [pair for word in words for pair in _NEXT_KEY.split(word)]
             if named and pairs and "=" not in pairs[0]:
                 first = pairs.pop(0)
+            _refuse_repeated(pairs)
             text, name = "\n".join(_line(pair, example) for pair in pairs) or "{}", _WORDS
         try:
             written = cls(grow(parse(text, name), name, literal), in_words=file is None, name=first)
@@ -113,6 +114,15 @@ class WrittenEntry:
             steps = [int(step) if step.isdecimal() else step for step in path.split("/")[1:]]
             found.append(Problem(self.grown.marks.value(*steps), what, fix))
         return InputError(found)
+
+
+def _refuse_repeated(pairs: Sequence[str]) -> None:
+    first: dict[str, str] = {}
+    for pair in pairs:
+        key = pair.partition("=")[0]
+        if key in first:
+            raise InputError(f"{key} is given twice, {first[key]} and {pair}; remove one of them")
+        first[key] = pair
 
 
 def _line(word: str, example: str = _EXAMPLE) -> str:

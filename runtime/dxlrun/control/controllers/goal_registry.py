@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from dxlrun.channels.answers import Code, Refusal
 from dxlrun.channels.cycle import LOST_CYCLES, Commands, CycleRecord, Floats, Torque
-from dxlrun.channels.event_records import EventBody, EventSink, GoalReport
+from dxlrun.channels.event_records import RUN_ENDED, EventBody, EventSink, GoalReport
 from dxlrun.contract.controller import GoalTolerances, Outcome
 from dxlrun.control import texts
 from dxlrun.control.controllers.published_topics import Publisher, TopicLog
@@ -493,7 +493,8 @@ class GoalRegistry:
     def _report_goal(self, goal: RunningGoal, event: EventBody, status: str) -> None:
         error = goal.error if math.isfinite(goal.error) else None
         about = goal.number, goal.controller, goal.kind, goal.origin
-        report = GoalReport(*about, status, goal.text, goal.joint, error)
+        refused = goal.refusal is not None and goal.text != RUN_ENDED
+        report = GoalReport(*about, status, goal.text, goal.joint, error, refused)
         self._events.emit_event(goal.controller, event, msgspec.json.encode(report))
         self.publish(goal, status)
 

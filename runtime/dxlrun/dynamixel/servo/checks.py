@@ -461,7 +461,7 @@ def _silence(plan: BusPlan, silent: Sequence[ServoPlan]) -> str:
         return f"{plan.label(silent[0])} does not answer: {remedy}; {help_link('one-servo-does-not-answer')}"
     named = [f"{servo.own_name} (ID {servo.servo_id})" for servo in silent[:_MOST_NAMED]]
     more = ", ".join(str(servo.servo_id) for servo in silent[_MOST_NAMED:])
-    names = ", ".join(named) + (f" and IDs {more}" if more else "")
+    names = ", ".join(named) + (f" and ID{'s' * (len(silent) > _MOST_NAMED + 1)} {more}" if more else "")
     if len(silent) == len(plan.servos):
         remedy = choose_remedy(
             plan.port, f"check its power, cable, port and {rate}", simulated=f"check its {rate}"
