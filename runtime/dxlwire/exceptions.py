@@ -188,6 +188,9 @@ def suggestion(name: str, known: Iterable[str], otherwise: str = "") -> str:
     """Return a hint for an unknown name: `did you mean ...?` with similar names, else `otherwise`, else
     the list of known names."""
     known = sorted(set(known))
+    words = name.split()
+    if len(words) > 1 and set(words) <= set(known):
+        return f"write {', '.join(words)}"
     if meant := near(name, known):
         return f"did you mean {' or '.join(meant)}?"
     return otherwise or (f"known: {', '.join(known)}" if known else "there is none")

@@ -128,6 +128,11 @@ def test_a_missing_device_and_a_file_are_named(tmp_path):
     with pytest.raises(PortError, match=f"not found; check the path, .*`dxlrun sim --link {path}`"):
         open_serial(str(path), 1_000_000)
     path.touch()
+    with pytest.raises(PortError, match=r"port COM3 not found; that is a port of Windows; "):
+        open_serial("COM3", 57_600)
+    with pytest.raises(PortError, match=r"port null not found; write /dev/null") as refused:
+        open_serial("null", 57_600)
+    assert refused.value.__suppress_context__  # a script shows the sentence after one traceback
     with pytest.raises(PortError, match="is not a serial line"):
         open_serial(str(path), 1_000_000)
 

@@ -231,6 +231,8 @@ def _without_output(tokens: Sequence[str]) -> list[str]:
 
 _OF_ROBOT = ("robot", "file", "config", "f")
 """Names that other programs give to their option for the robot file, which is positional here."""
+_SIMULATED = ("sim", "simulate", "simulated", "simulation")
+"""Names that other programs give to their option for simulated servos."""
 
 
 def _right_form(error: CycloptsError, tokens: Sequence[str]) -> str:
@@ -252,10 +254,19 @@ def _right_form(error: CycloptsError, tokens: Sequence[str]) -> str:
             words = [part for word in given for part in _parts(word, sign)]
             if len(words) == len(given) + 1 and all(words):
                 return shlex.join(("dxlrun", *verb, *words))
-    if isinstance(error, CoercionError) and verb == ["torque"] and {"on", "off"} & set(given[1:]):
-        state = next(word for word in given if word in ("on", "off"))
-        return shlex.join(("dxlrun", "torque", state, *(word for word in given if word != state)))
-    return ""
+    return _in_order(verb, given) if isinstance(error, CoercionError) else ""
+
+
+def _in_order(verb: Sequence[str], given: Sequence[str]) -> str:
+    """Return the command line with the state of `torque` or the port of `servo` as its first word."""
+    early = [
+        word
+        for word in given[1:]
+        if {"torque": word in ("on", "off"), "servo": word[:1] == "/"}.get(" ".join(verb))
+    ]
+    if not early:
+        return ""
+    return shlex.join(("dxlrun", *verb, early[0], *(word for word in given if word != early[0])))
 
 
 def _parts(word: str, sign: str) -> list[str]:
@@ -289,6 +300,8 @@ def _without_options(error: UnknownOptionError, verb: Sequence[str], given: Sequ
             words.append(value)
         elif value and name in _declared((*words, *rest)):
             last.append(f"{name}:={value}")
+        elif not value and name in _SIMULATED and "port" in _declared((*words, *rest)):
+            last.append("port:=sim")
         else:
             return ""
     return shlex.join(("dxlrun", *verb, *first, *words, *last))
@@ -325,6 +338,9 @@ def _usage_error(error: CycloptsError, tokens: Sequence[str]) -> str:
             return f"{option} is {new} now; {fix}"
         if meant := near(option.lstrip("-"), long) or short:
             fix = f"did you mean {' or '.join(f'--{name}' for name in meant)}?"
+    if isinstance(error, UnusedCliTokensError):
+        what = f"unexpected {' '.join(map(repr, error.unused_tokens or ()))}"
+    what = re.sub(r'unable to convert "(.*)" into int$', r"\1 is not a whole number", what)
     # With a keyword the option is there, but not its value.
     if isinstance(error, MissingArgumentError) and error.argument is not None and error.keyword is None:
         name = error.argument.name

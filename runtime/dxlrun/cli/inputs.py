@@ -161,6 +161,8 @@ def _assignment_for(word: str) -> str:
     """Return a suggestion for a word that is not `name:=value`: that form, or `--play` for a YAML file."""
     if word.endswith((".yaml", ".yml")):
         return f"--play {word.removeprefix('play=').removeprefix('play:')}"
+    if word == "sim" or re.match(r"/dev/|COM\d+$", word):
+        return f"port:={word}"
     match = re.fullmatch(r"([A-Za-z_]\w*)\s*[=:]\s*(.*)", word, re.DOTALL)
     return f"{match[1]}:={match[2] or 'VALUE'}" if match else "name:=value"
 

@@ -97,6 +97,7 @@ _OTHER_WORDS = {
     "get": "read",
     "examples": "init new",
     "teach": "record",
+    "--version": "version",
 }
 """Verb -> words that other programs use for it; the empty verb is `dxlrun ROBOT.yaml`."""
 
@@ -158,9 +159,10 @@ def names() -> list[str]:
 
 
 def examples_of(verb: Sequence[str]) -> list[str]:
-    """Return the example command lines of a command; empty without one."""
+    """Return the example command lines of a command, or of a run; empty without one."""
     words = ["dxlrun", *verb]
-    return [line for line in EXAMPLES.read_text().splitlines() if line.split()[: len(words)] == words]
+    lines = [line for line in EXAMPLES.read_text().splitlines() if line.split()[: len(words)] == words]
+    return lines if verb else [line for line in lines if line.split()[1].endswith(".yaml")]
 
 
 def require_package(verb: str) -> None:

@@ -136,7 +136,8 @@ def where_to_get(type_name: str, known: Sequence[str], broken: Mapping[str, str]
         return broken[type_name]
     if type_name in _REMOVED:
         return _REMOVED[type_name]
-    close = suggestion(type_name, known, _OFFERED)
+    named = [each for each in known if type_name in each.split("_")]  # `gripper`, `trajectory`
+    close = suggestion(type_name, known, f"did you mean {' or '.join(named)}?" if named else _OFFERED)
     if not broken:
         return close
     why = "; ".join(broken.values())

@@ -78,6 +78,11 @@ class Arguments:
         path = ("arguments", name)
         if not _NAME.fullmatch(name):
             self._problem(path, f"{name!r} is not a valid name of an argument", "use letters, digits and _")
+        if isinstance(entry, str | int | float):
+            self._problem(
+                path, f"{name} has no key for its default", f"write `{name}: {{default: {text_of(entry)}}}`"
+            )
+            return
         try:
             default = Argument.model_validate(entry).default
         except ValidationError as error:

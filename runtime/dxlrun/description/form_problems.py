@@ -469,7 +469,8 @@ def _only_key(error: _Error) -> str:
         meant = takes
     if len(meant) != 1:
         return ""
-    return f"write `{error.path[-1]}: {{{meant[0]}: {yaml_text(error.input)}}}`"
+    more = ", ..." * any(info.is_required() for name, info in form.model_fields.items() if name != meant[0])
+    return f"write `{error.path[-1]}: {{{meant[0]}: {yaml_text(error.input)}{more}}}`"
 
 
 def _is_key_of_entry(error: _Error) -> bool:
@@ -497,6 +498,9 @@ def _indentation(error: _Error) -> str:
 def _example(error: _Error) -> str:
     key = error.path[-1] if error.path else ""
     example = error.example if isinstance(key, str) else None
+    if example is None and error.model is not None and error.path[1:] and error.location[1:]:
+        # An entry has no example of its own, but its section has one.
+        key, example = error.path[-2], _example_at(error.model, error.location[:-1])
     return "" if example is None else f"write for example `{key}: {example}`"
 
 

@@ -85,7 +85,7 @@ class PyserialLine:
             named = {"FileNotFoundError": errno.ENOENT, "PermissionError": errno.EBUSY}
             known = (number for name, number in named.items() if name in str(error))
             number = next(known, getattr(error, "errno", None) or 0)
-            raise PortError(describe_failure(path, baud_rate, OSError(number, str(error)))) from error
+            raise PortError(describe_failure(path, baud_rate, OSError(number, str(error)))) from None
         self.close: Callable[[], None] = self._serial.close
 
     def set_rate(self, baud_rate: int) -> bool:

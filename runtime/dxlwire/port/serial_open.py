@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import struct
 import time
 from collections.abc import Callable, Iterable
@@ -145,7 +146,7 @@ def open_serial(
     try:
         line = SerialLine(path, baud_rate)
     except OSError as error:
-        raise PortError(describe_failure(path, baud_rate, error, describe_holder)) from error
+        raise PortError(describe_failure(path, baud_rate, error, describe_holder)) from None
     if rs485 and not is_simulated(path):
         try:
             fcntl.ioctl(line.fileno(), _TIOCSRS485, _RS485)
@@ -154,7 +155,7 @@ def open_serial(
             raise PortError(
                 f"the driver of {path} has no RS-485 mode ({error.strerror}); omit `adapter: {{rs485: "
                 "true}`, and use an adapter with automatic direction control"
-            ) from error
+            ) from None
     if line.set_dtr and boot_ns:
         time.sleep(boot_ns * 1e-9)
     return line
@@ -199,8 +200,16 @@ def describe_failure(
 
 
 def _what_exists(path: str) -> str:
+    if "/" not in path and os.path.exists(f"/dev/{path}"):
+        return f"write /dev/{path}"
+    if re.fullmatch(r"COM\d+", path):
+        return f"that is a port of Windows; {_devices()}"
     if "/" in path and not os.path.abspath(path).startswith("/dev/"):
         return f"check the path, or start the program that makes it, such as `dxlrun sim --link {path}`"
+    return _devices()
+
+
+def _devices() -> str:
     devices = serial_devices()
     if not devices:
         return f"plug in a serial adapter; {help_link('there-is-no-port')}"

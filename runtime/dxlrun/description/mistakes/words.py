@@ -21,6 +21,7 @@ from dxlrun.description.mistakes.forms import (
     Place,
     entries_of,
     example_at,
+    keys_for,
     keys_of,
     may_be_entry,
     places_of,
@@ -157,6 +158,7 @@ class UnknownKeyContext(msgspec.Struct, frozen=True):
             return f"remove it, or `{key}`: both mean the same"
         if (
             isinstance(value, dict | list)
+            and key in keys_for(self.form, value)
             and not meaning.kind
             and key not in self.present
             and len(place) == 1
@@ -198,7 +200,9 @@ class UnknownKeyContext(msgspec.Struct, frozen=True):
         if (key.endswith((")", "]")) or is_joint) and value is None:
             fix = "write a list in square brackets: [a, b]"
         elif re.match(r"\d+ *[a-z%]", key) and value is None:
-            fix = f"write a point instead of the decimal comma, such as 1.{key}"
+            fix = f"write a point instead of a decimal comma, such as 1.{key}, or a list in square brackets"
+        elif re.fullmatch(r"\d{3}", key) and value is None:
+            fix = "write the number without commas, such as 1_000_000"
         elif sign and word in self.known and value is None:
             how = "write a space after the colon" if sign == ":" else "write a colon instead of ="
             fix = f"{how}: `{word}: {rest}`"
