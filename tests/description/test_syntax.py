@@ -21,6 +21,7 @@ from dxlrun.errors import InputError, Mark
 WRONG = [
     ("a: {port: ${port}, x: 1}\n", "1:12: ${...} inside { } or [ ] has no quotes", 'write "${name}"'),
     ("a:\n\tb: 1\n", "2:1: the indentation contains a tab", "spaces"),
+    ("a:\n  - b: 1\n\tc: 2\n", "3:1: the indentation contains a tab", "spaces"),
     ("a: b: c\n", "1:5: this ':' is not allowed here", "quotes"),
     ("a: [1, 2\nb: 3\n", "1:4: this [ is not closed", "write ] at the end of line 1"),
     ("a: 1\nb: 'x\nc: 1\n", "2:4: this quote is not closed", "close"),
@@ -31,8 +32,8 @@ WRONG = [
     ("a: }\n", "1:4: a value is missing", "write a value"),
     ("a: - b\n", "1:4: a list cannot start here", "new line"),
     ("a: 1\n---\nb: 1\n", "2:1: a second document", "one document"),
-    ("", "1:1: the file is empty", "describe"),
-    ("# nothing\n", "1:1: the file is empty", "describe"),
+    ("", "1:1: the file is empty", "key: value"),
+    ("# nothing\n", "1:1: the file is empty", "key: value"),
     ("- a\n", "1:1: the file is not a mapping", "key: value"),
     ("a: >5x\n", "1:6: this is not YAML (", "correct"),
 ]

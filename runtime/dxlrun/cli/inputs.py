@@ -225,8 +225,8 @@ def write_report(target: Path, page: str) -> None:
 
 def known_file(robot: Path) -> None:
     """Raise InputError with a suggestion when a word is not an existing robot file."""
-    if robot.is_file():
-        return
+    if robot.exists() and not robot.is_dir():
+        return  # what is not a regular file is refused when it is read
     word = str(robot)
     if robot.is_dir():
         raise InputError(f"{word} is a directory; give the robot file in it")

@@ -189,7 +189,7 @@ def parse(text: str, file: str) -> Tree:
     except yaml.YAMLError as error:
         raise refusal(Mark(file), f"this is not YAML ({error})", "correct it") from None
     if root is None:
-        raise refusal(Mark(file), "the file is empty", "describe a robot or a motion in it")
+        raise refusal(Mark(file), "the file is empty", "write `key: value` lines")
     if not isinstance(root, yaml.MappingNode):
         raise refusal(node_mark(root, file), "the file is not a mapping", "write `key: value` lines")
     return Tree(root, problems)
@@ -256,7 +256,7 @@ def _explained(error: yaml.MarkedYAMLError, text: str, file: str) -> Problem:
     character = line[mark.column - 1 : mark.column]
     if "expected ',' or" in reported and line[: mark.column - 1].endswith("$"):
         return Problem(mark, "${...} inside { } or [ ] has no quotes", 'write "${name}"')
-    if "cannot start any token" in reported and character == "\t":
+    if "found a tab" in reported or ("cannot start any token" in reported and character == "\t"):
         return Problem(mark, "the indentation contains a tab", "indent with spaces")
     for part, what, fix in _WORDS:
         if part in reported:

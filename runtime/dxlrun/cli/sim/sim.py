@@ -188,7 +188,7 @@ def _simulated(
         return _SimulationSetup("simulation", SimulationConfig((servo_bus(servo, baud, protocol),)))
     options = {"--servo": servo or None, "--baud": baud, "--protocol": protocol}
     given = [name for name, value in options.items() if value is not None]
-    if servo and not robot.is_file():
+    if (servo or ":" in str(robot)) and not robot.is_file():
         raise InputError(f"{robot} is not a robot file; give each servo by --servo, such as --servo {robot}")
     if given:
         raise InputError(f"{' and '.join(given)} and a robot file exclude each other; omit one of them")
