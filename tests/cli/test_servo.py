@@ -44,7 +44,7 @@ class OnALine(Stage):
         self._lines, self._dxlrun = lines, dxlrun
         self.given = {"servos": self._servos, "boards": self._boards, "tripped": self._await_watchdog}
         self.asked = {"written": self._written}
-        self.names = {"NEW": [*NEW], "FAST": [*NEW[:-1], "2000000"]}
+        self.names = {"NEW": [*NEW], "OLD": [*OLD], "FAST": [*NEW[:-1], "2000000"]}
 
     def _servos(self, line: str) -> None:
         model, protocol, *ids = line.replace(":", "").split()
@@ -53,8 +53,9 @@ class OnALine(Stage):
 
     def _boards(self, line: str) -> None:
         boards = tuple(DeviceConfig(int(each), model) for model, each in re.findall(r"([\w-]+): (\d+)", line))
-        servos = (ServoConfig(1, "XL430-W250", 3.0),)
-        self._serve(BusConfig("main", 1_000_000, servos, 2.0, devices=boards))
+        protocol = 1.0 if line.startswith("1.0") else 2.0
+        servos = (ServoConfig(1, "MX-28" if protocol == 1.0 else "XL430-W250", 3.0),)
+        self._serve(BusConfig("main", 1_000_000, servos, protocol, devices=boards))
 
     def _serve(self, bus: BusConfig) -> None:
         path, self._finish = self._lines.serve(bus)
@@ -186,13 +187,3 @@ def test_packets_of_a_verb_are_a_log_when_it_is_named(one: Any, tmp_path: Path) 
     assert writes(entries)
     assert read.complete
     assert " servo " in read.metadata["tool"]["command"]
-
-
-def test_boards_of_protocol_1_are_found(dxlrun: Dxlrun, virtual_lines: VirtualLines) -> None:
-    servos, devices = (ServoConfig(1, "MX-28", 3.0),), (DeviceConfig(200, "CM-730"),)
-    path, _ = virtual_lines.serve(BusConfig("main", 1_000_000, servos, 1.0, devices=devices))
-    said = dxlrun("scan", path, *OLD, "--ids", "1,200", "--json")
-    found = [(each["servo_id"], each["model"]) for each in result_of(said.out)["servos"]]
-    assert found == [(1, "MX-28"), (200, "CM-730")]
-    said = dxlrun("servo", path, 200, "set", "dynamixel_power", 1, *OLD)
-    assert "Dynamixel Power (24) was changed from 0 to 1" in said.out

@@ -16,7 +16,7 @@ from dxlrun.compile.controller_graph import ControllerGraph, GraphEdge
 from dxlrun.compile.policies import MARGIN_NS
 from dxlrun.compile.robot_compiler import compile_files, compile_robot
 from dxlrun.description.reading import read_robot
-from dxlrun.errors import InputError, Mark
+from dxlrun.errors import InputError
 from dxlrun.plan.loop_plan import ControllerPlan, JointPlan
 from dxlrun.plan.robot_plan import SimulationPlan, from_json, to_json
 from dxlwire.joint_unit import LINEAR
@@ -181,25 +181,6 @@ def test_highest_rate_that_is_named_is_possible_and_the_next_one_is_not(
         assert f"{rate} Hz (argument rate:={rate}) is {period}" in one.what
         assert "lower the rate to at most 719 Hz" in one.fix
         assert "an adapter without a latency timer would allow 2564 Hz" in one.fix
-
-
-# A URDF of a fragment
-
-
-def test_urdf_of_a_fragment_is_next_to_the_fragment() -> None:
-    Path("sub").mkdir()
-    Path("sub", "look.yaml").write_text("model: {urdf: pair.urdf}\n")
-    with pytest.raises(InputError) as caught:
-        compile_text(f"include: [sub/look.yaml]\n{PAIR}")
-    (error,) = [each for each in caught.value.problems if each.severity == "error"]
-    assert (error.mark, error.what) == (
-        Mark(f"{Path.cwd()}/sub/look.yaml", 1, 15),
-        "URDF pair.urdf not found",
-    )
-    Path("sub", "pair.urdf").write_text('<robot name="pair"><link name="body"/></robot>')
-    plan = compile_text(f"include: [sub/look.yaml]\n{PAIR}").plan
-    assert plan.urdf == '<robot name="pair"><link name="body"/></robot>'
-    assert plan.included == {"sub/look.yaml": "model: {urdf: pair.urdf}\n"}
 
 
 def test_character_that_is_not_allowed_in_a_urdf_is_refused_at_its_place() -> None:

@@ -14,7 +14,7 @@ from msgspec.structs import replace
 
 from dxlrun.channels.answers import Completion
 from dxlrun.control.controllers.plugin_loading import Offer, PlugIns
-from dxlrun.plan.loop_plan import ControllerPlan, JointPlan, ServoLimit
+from dxlrun.plan.loop_plan import ControllerPlan, JointPlan
 from dxlrun.remote import gateway
 from dxlrun.remote.preparation import Preparation
 from dxlrun.remote.requests.request_table import Role
@@ -130,20 +130,6 @@ motions:
     )
 
 
-def test_the_speed_scales_accelerations_by_its_square(head):
-    activate(head, "arm")
-    point = "{time: %s s, joints: {tilt: {position: %s rad, velocity: 0 rad/s, acceleration: %s rad/s^2}}}"
-    points = ", ".join(point % one for one in ((0, 0.2, 0.4), (1, 0.4, -0.8)))
-    _, _, (arm,) = play(head, f"{HEAD % 'arm'}    points: [{points}]\n", 0.5)
-    rows = [(0.0, 0.2, 0.1), (2.0, 0.4, -0.2)]
-    points = [{"time": t, "positions": [at], "velocities": [0.0], "accelerations": [a]} for t, at, a in rows]
-    command = JointTrajectoryController.Commands["trajectory"](points=points, start_in=0.0)
-    parameters = JointTrajectoryController.Parameters(joints=("tilt",))
-    np.testing.assert_allclose(
-        arm[3][0], JointTrajectoryController.prepare("trajectory", command, parameters), atol=1e-12
-    )
-
-
 def test_wheels_have_no_way_to_a_first_pose(head):
     activate(head, "wheel")
     text = "name: roll\nmotions:\n  - controller: wheel\n    points: [{time: 0 s, joints: {tilt: {velocity: 1 rad/s}}}]\n"
@@ -233,16 +219,6 @@ def test_a_joint_that_is_slower_than_the_soft_speed_gets_its_own_time(head):
     joints = head.gateway._preparation.joints
     joints["pan"] = replace(joints["pan"], velocity=0.25)
     assert lead_to(head, 0.7)[0][-1] == pytest.approx(2.0)
-
-
-def test_motion_of_a_joint_that_a_register_holds_still_is_refused(head):
-    limit = ServoLimit("velocity", 0.0, "Velocity Limit (44) = 0, 0 rad/s")
-    head.gateway._preparation.take_servo_limits("pan", (limit,))
-    text = HEAD % "positions" + POINT % "pan: {position: 0.7 rad}"
-    status, answer, taken = play(head, text)
-    assert (status, answer["code"], taken) == (422, "wrong_motion", [])
-    assert any("Velocity Limit (44) = 0" in problem for problem in answer["fields"]["problems"])
-    assert lead_to(head, 0.201)[0] == [0.0], "a joint that is there needs no speed"
 
 
 def test_the_way_begins_at_the_goal_of_a_joint_not_where_it_lags_behind(head):

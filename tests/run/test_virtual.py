@@ -8,15 +8,12 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from dxlrun.channels.commands import CommandMessage
-from dxlrun.channels.event_records import EventCode
 from dxlrun.errors import InputError
 from dxlrun.log.ledger_file import open_ledger
 from dxlrun.log.log_reader import read_log
 from dxlrun.plan.robot_plan import Plan
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.testing import plan_of, simulated_robot
-from dxlrun_analysis.joints.goal_tracking import tracking
 from dxlsim.bus.ledger import read_ledger
 from dxlsim.faults.fault import parse_fault
 from dxlsim.faults.script import FaultScript
@@ -98,28 +95,6 @@ def test_virtual_time_refuses_a_real_port():
     plan = plan_of(TORSO, arguments={"port": "/dev/ttyUSB0"}, duration_s=1.0)
     with pytest.raises(InputError, match="port:=sim"):
         VirtualRobot(plan)
-
-
-def test_set_points_beyond_the_limits_are_clamped_and_the_log_counts_the_cycles(tmp_path):
-    robot = simulated_robot(TORSO, duration_s=2.5, log=tmp_path / "run.mcap")
-    data = np.array([0.1, np.radians(9999), 1.0, 1e300]).tobytes()  # head_pitch_joint, head_yaw_joint
-    streamed = CommandMessage(1, "head", "posvel", data, "anna", lease_ns=10_000_000_000)
-    begun_ns = 2_000_000_000  # the first second is slow
-    robot.buses[0].at(begun_ns, lambda: robot.inbox.waiting.append(streamed))
-    assert robot.run().reason == "ended"
-    log = read_log(tmp_path / "run.mcap")
-    count = {joint.name: joint.clamped for joint in tracking(log)}
-    (taken,) = np.flatnonzero(np.diff(log.cycles["command_count"])[1:] > 0) + 2
-    assert count.pop("head_yaw_joint") == len(log.cycles) - taken
-    assert set(count.values()) == {0}
-    row = log.joints.index("head_yaw_joint")
-    upper, speed = (getattr(robot.plan.loop.joints[row], name) for name in ("upper", "highest_speed"))
-    assert log.cycles["goal_position"][-1, row] == upper
-    assert log.cycles["goal_velocity"][-1, row] == speed < 10
-    told = [event.text for event in log.events if event.code == EventCode.GATE]
-    assert any(
-        "head_yaw_joint, controller head: goal lowered to the upper position limit" in text for text in told
-    )
 
 
 def test_the_progress_of_a_run_on_virtual_time_has_the_skipped_periods():
