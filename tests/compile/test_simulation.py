@@ -1,4 +1,4 @@
-"""Simulated servos that share joints or bodies, MuJoCo that is missing, and motor files."""
+"""Simulated servos that share joints or bodies, MuJoCo that is missing, and controllers that need motors."""
 
 import importlib.util
 import math
@@ -7,20 +7,18 @@ from pathlib import Path
 
 import pytest
 from msgspec.structs import replace
-from tests.kit.robots import PAIR, compile_text, problems_in, robot_text
+from tests.kit.cases import read_head
+from tests.kit.robots import CASES, PAIR, compile_text, problems_in
 
-from dxlrun import MotorModel, Stribeck
 from dxlrun.compile.robot_compiler import compile_files
 from dxlrun.compile.simulation import simulation_of
 from dxlrun.control.controllers.plugin_loading import load_plugins
-from dxlrun.description.joints.motor_file import read_motor
 from dxlrun.errors import InputError
 from dxlrun.plan.mechanics_plan import CouplingPlan, MechanicsPlan
-from dxlrun.plan.robot_plan import from_json, to_json
 from dxlrun.remote.preparation import Preparation, RefusedRequest
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun_analysis.replay.changes import Setting, with_settings
-from dxlsim.simulation_plan import Load, Mechanism, MechanismServo, UrdfBodies
+from dxlsim.simulation_plan import Load, Mechanism, MechanismServo
 
 URDF = """<robot name="pair"><link name="body"/><link name="left"/><link name="right"/>
 <joint name="left_arm_joint" type="revolute"><parent link="body"/><child link="left"/>
@@ -36,14 +34,10 @@ def _urdf(here: None) -> None:
     Path("pair.urdf").write_text(URDF, encoding="utf-8")
 
 
-def _with_load(words: str) -> str:
-    """Give the left arm a load."""
-    return BODIES.replace("    direction: -1\n", f"    direction: -1\n    simulation: {words}\n", 1)
-
-
 @PHYSICS
 def test_servos_that_share_joints_are_simulated_together() -> None:
-    plan = compile_text(_with_load("{inertia: 0.02 kg m^2}")).plan
+    load = "    direction: -1\n    simulation: {inertia: 0.02 kg m^2}\n"
+    plan = compile_text(BODIES.replace("    direction: -1\n", load, 1)).plan
     coupling = CouplingPlan("arms", (0, 1), (1, 0), ((0.5, 0.5), (0.5, -0.5)), ((1, 1), (1, -1)))
     coupled = replace(plan, mechanics=MechanicsPlan((coupling,), servos=("left", "right")))
     simulation = simulation_of(coupled)
@@ -63,29 +57,6 @@ def test_servos_that_share_joints_are_simulated_together() -> None:
     elsewhere = replace(coupled, buses=(replace(plan.buses[0], servos=(left,)), real))
     (alone,) = simulation_of(elsewhere).mechanisms
     assert alone.is_single, "one of them is on a real port"
-
-
-@PHYSICS
-def test_bodies_are_turned_by_the_servos_in_the_order_of_the_buses() -> None:
-    # the first joint of the file is on the second bus
-    two = BODIES.replace("loop:", "  second: {port: sim, protocol: 1.0, baud_rate: 1_000_000}\nloop:", 1)
-    two = two.replace("bus: main\n    id: 1", "bus: second\n    id: 1", 1)
-    simulation = simulation_of(compile_text(two).plan)
-    assert [each.servo_id for bus in simulation.buses for each in bus.servos] == [2, 1]
-    assert simulation.bodies == UrdfBodies(
-        URDF,
-        (
-            Mechanism((MechanismServo(0, pytest.approx(math.radians(240)), 1),), ("right_arm_joint",)),
-            Mechanism((MechanismServo(1, pytest.approx(math.radians(60)), -1),), ("left_arm_joint",)),
-        ),
-    )
-
-
-@PHYSICS
-def test_with_mujoco_the_urdf_says_what_a_joint_moves() -> None:
-    found = problems_in(_with_load("{inertia: 1 kg cm^2, friction: 0.1 Nm}"))
-    told = [each.what for each in found if "physics" in each.what]
-    assert told == ["with physics: mujoco the URDF defines the inertia of left_arm_joint"]
 
 
 def test_mujoco_that_is_not_installed_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -157,65 +128,11 @@ def test_simulated_servo_has_the_homing_offset_of_the_robot_file() -> None:
     assert first.shaft_angle == pytest.approx(math.radians(200), abs=0.05)
 
 
-ROBOT = robot_text("motors")
-MOTOR_FILE = Path("shoulder.yaml")
-
-
-@pytest.fixture
-def motor(here: None) -> MotorModel:
-    """The motor of the cases, in its file."""
-    text = (Path(__file__).with_name("cases") / "motors.txt").read_text()
-    MOTOR_FILE.write_text(text.partition("---- shoulder.yaml\n")[2].partition("====")[0])
-    return read_motor(MOTOR_FILE).motor
-
-
-@pytest.mark.parametrize(
-    ("more", "turns", "count"),
-    [("gear_ratio: 2", 2.0, 1), ("servos: [{id: 1}, {id: 3, direction: 1}]", 1.0, 2)],
-)
-def test_joint_has_the_motor_that_it_feels(motor: MotorModel, more: str, turns: float, count: int) -> None:
-    """Torque, speed without load, power and friction are those of the servos behind the gear."""
-    text = ROBOT.replace("motor: shoulder.yaml}", f"motor: shoulder.yaml, {more}}}")
-    plan = compile_text(text.replace("id: 1, model", "model") if count == 2 else text).plan
-    assert from_json(to_json(plan)) == plan
-    joint, model = plan.loop.joints[0].motor, plan.loop.joints[0].servo_model
-    assert joint is not None
-    assert joint.stiffness is not None
-    assert motor.stiffness is not None
-
-    def torque(motor: MotorModel, duty: float, speed: float) -> float:
-        drive = duty * motor.voltage - motor.torque_constant * speed
-        return motor.torque_constant / motor.resistance * drive
-
-    for error, speed in ((0.1, 0.0), (0.02, 1.5), (-0.05, -3.0)):
-        at_servo = torque(motor, motor.stiffness * error * turns, speed * turns)
-        assert torque(joint, joint.stiffness * error, speed) == pytest.approx(count * turns * at_servo)
-    assert joint.inertia == pytest.approx(count * turns**2 * motor.inertia)
-    assert joint.friction == pytest.approx(count * turns * motor.friction)
-    assert joint.viscous_friction == pytest.approx(count * turns**2 * motor.viscous_friction)
-    assert joint.stribeck == Stribeck(0.05 * count * turns, 0.2 / turns)
-    assert joint.load == motor.load
-    if count == 2:
-        assert model is None  # of several servos each has a heat of its own
-    else:
-        assert model is not None
-        assert (model.stall_torque, model.stall_current) == (12.0, 4.1)
-        assert model.no_load_speed == pytest.approx(6.6 / 2, abs=0.01)
-
-
-def test_file_is_looked_for_beside_the_file_that_names_it(motor: MotorModel) -> None:
-    Path("arms").mkdir()
-    MOTOR_FILE.rename(Path("arms", "shoulder.yaml"))
-    head, joints = ROBOT.split("joints:\n")
-    Path("arms", "joints.yaml").write_text(f"joints:\n{joints}")
-    plan = compile_text(f"include: [arms/joints.yaml]\n{head}").plan
-    assert plan.simulation.motors["shoulder"] == motor
-    assert sorted(plan.included) == ["arms/joints.yaml", "arms/shoulder.yaml"]
-
-
-def test_controller_of_a_running_robot_or_a_replay_needs_motors_too(motor: MotorModel) -> None:
+def test_controller_of_a_running_robot_or_a_replay_needs_motors_too() -> None:
+    robot, _, motor = read_head(CASES / "motors.txt").partition("---- shoulder.yaml\n")
+    Path("shoulder.yaml").write_text(motor)
     law = "controllers:\n  law: {type: feed_forward, joints: [shoulder]}\n"
-    loop, plugins = compile_text(ROBOT + law).plan.loop, load_plugins()
+    loop, plugins = compile_text(robot + law).plan.loop, load_plugins()
     preparation = Preparation({joint.name: joint for joint in loop.joints}, plugins)
     entry = {"name": "more", "type": "feed_forward", "joints": ["shoulder"]}
     assert preparation.controller(entry, {}, 200.0).joints == ("shoulder",)
