@@ -42,6 +42,7 @@ SOURCES = tuple(
         ("runtime", "dxlrun", "channels", "shared_memory.c"),
         ("runtime", "dxlsim", "motion", "mechanics.c"),
         ("plugins", "dxlrun_analysis", "servos", "pairing.c"),
+        ("plugins", "dxlrun_analysis", "joints", "movement.c"),
     )
 )
 """Each is compiled into an object of its own, which lies beside it: libkernel.so."""

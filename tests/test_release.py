@@ -46,6 +46,7 @@ OBJECTS = {
         "dxl_take",
         "dxl_source",
     },
+    "dxlrun_analysis/joints/libmovement.so": {"movement_add", "dxl_source"},
     "dxlrun_analysis/servos/libpairing.so": {"pairing_split", "pairing_pair_replies", "dxl_source"},
 }
 """The objects of a wheel, and functions of each."""

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from dxlrun import Floats
 
-_BINS = 512  # Even, because bins are merged in pairs
+BINS = 512  # Even, because bins are merged in pairs
 _FIRST_BIN_NS = 100_000_000
 
 
@@ -21,7 +21,7 @@ class Bins:
     """Minimum, mean and maximum of several quantities of each joint in 512 time bins of 0.1 s or more."""
 
     def __init__(self, quantities: int = 0, joints: int = 0, begin_ns: int = 0) -> None:
-        shape = (quantities, _BINS, joints)
+        shape = (quantities, BINS, joints)
         self.begin_ns, self.bin_ns = begin_ns, _FIRST_BIN_NS
         self._values = [np.full(shape, empty) for _, empty in _JOINS]
 
@@ -32,9 +32,7 @@ class Bins:
             times: Times of the cycles in ns, shape (cycles,).
             values: Values of each quantity, NaN if unknown; shape (joints, cycles).
         """
-        while int(times[-1]) - self.begin_ns >= _BINS * self.bin_ns:
-            self._halve()
-        index = np.clip((times - self.begin_ns) // self.bin_ns, 0, _BINS - 1)
+        index = self.find_bins(times)
         starts = np.flatnonzero(np.diff(index, prepend=-1))
         bins, lengths = index[starts], np.diff(starts, append=len(index)).astype(np.float64)
         for quantity, every in enumerate(values):
@@ -46,9 +44,20 @@ class Bins:
             counts = lengths[:, None] if whole else np.add.reduceat(known, starts, axis=1, dtype=np.float64).T
             self._values[3][quantity, bins] += counts
 
+    def find_bins(self, times: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the bin of each time (ns), after making the bins long enough for the last one."""
+        while int(times[-1]) - self.begin_ns >= BINS * self.bin_ns:
+            self._halve()
+        return np.clip((times - self.begin_ns) // self.bin_ns, 0, BINS - 1)
+
+    @property
+    def columns(self) -> dict[str, Floats]:
+        """Minimum, maximum, sum and number of values of each bin, shape (quantities, bins, joints)."""
+        return dict(zip(("least", "most", "total", "count"), self._values, strict=True))
+
     def _halve(self) -> None:
         """Merge the bins in pairs, which doubles their length."""
-        half = _BINS // 2
+        half = BINS // 2
         for (join, empty), array in zip(_JOINS, self._values, strict=True):
             array[:, :half] = join(array[:, 0::2], array[:, 1::2])
             array[:, half:] = empty

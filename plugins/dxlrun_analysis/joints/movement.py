@@ -7,17 +7,21 @@ time.
 
 from __future__ import annotations
 
+import ctypes
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun import Floats
+from dxlrun.tooling.compiled_code import load_compiled, parse_structs
 from dxlrun.tooling.records import Torque
 from dxlrun_analysis.finding import Finding, Rank
-from dxlrun_analysis.joints.bins import Bins
+from dxlrun_analysis.joints.bins import BINS, Bins
 from dxlrun_analysis.joints.failing import (
     AWAY,
     AWAY_RAD,
@@ -35,47 +39,36 @@ from dxlrun_analysis.joints.trail import Trail
 
 _NONE: Mapping[str, float] = {}
 _FIELDS = (
-    *("read_ns", "age_ns", "torque", "valid", "position", "velocity", "effort"),
-    *("goal_position", "goal_effort"),
+    *("age_ns", "torque", "valid", "position", "velocity", "effort"),
+    *("goal_position", "goal_effort", "reference"),
 )
-"""Fields of the cycles that are used."""
+"""Fields of the cycles that `movement.c` uses, of each joint."""
 _WINDOW_S = 0.5  # Length of the long windows
-_JUMP_S = 0.5  # Positions further apart are not compared: the joint may have been moved by hand
-_TOO_FAST = 1.25  # A supply at its limit and a pulling load make a servo slightly faster than its model
-_SWING_RAD = 0.035  # 2 deg: smallest swing that counts
-_FULL_SPEED = 0.8
-"""A joint moves as fast as it can from this share of its greatest speed so far on."""
-_SLOWEST_TOP = 0.4
-"""Share of the model's top speed that a joint reaches at least, with a weak supply and a load."""
+_QUANTITIES = 8  # Rows of `Windows` and `Bins`
+SOURCE = Path(__file__).with_name("movement.c")
+_STRUCTS = parse_structs(SOURCE.read_text())
 
 
-@dataclass(slots=True)
-class _Jumps:
-    """Accumulator of the jumps in one joint's position: their number, first time and greatest distance."""
+class _Jumps(NamedTuple):
+    """Jumps in the positions of the joints, as columns of shape (joints,)."""
 
-    count: int = 0
-    first_ns: int = 0
-    longest: float = 0.0
-    read_ns: int = 0
-    position: float = math.nan
+    number: NDArray[np.int64]
+    first_ns: NDArray[np.int64]  # Time of the first jump
+    read_ns: NDArray[np.int64]  # Time of the last position
+    longest: Floats  # Greatest distance of a jump
+    position: Floats  # Last position; NaN, which is not compared, while the joint has no torque
 
-    def add_positions(self, joint: PlannedJoint, at_ns: NDArray[np.int64], position: Floats) -> None:
-        """Add positions of the joint with their times; NaN while it has no torque: not compared."""
-        at_ns, position = np.append(self.read_ns, at_ns), np.append(self.position, position)
-        seconds, moved = np.diff(at_ns) * 1e-9, np.abs(np.diff(position))
-        top = joint.logged.top_speed
-        turned: Floats | float = math.inf if top is None or joint.wraps else _TOO_FAST * top * seconds
-        jumps = (moved > np.maximum(MOVED_RAD * joint.share, turned)) & (seconds < _JUMP_S)
-        if jumps.any():
-            self.first_ns = self.first_ns or int(at_ns[1:][jumps][0])
-            self.longest = max(self.longest, float(moved[jumps].max()))
-            self.count += int(jumps.sum())
-        self.read_ns, self.position = int(at_ns[-1]), float(position[-1])
+    @classmethod
+    def of_joints(cls, joints: int) -> _Jumps:
+        """Return the state before the first position."""
+        number, first_ns, read_ns = np.zeros((3, joints), np.int64)
+        return cls(number, first_ns, read_ns, np.zeros(joints), np.full(joints, np.nan))
 
-    def finding(self, joint: PlannedJoint, begin_ns: int) -> Finding:
-        """Return the finding that the joint's position jumped; `begin_ns` is the start of the run."""
-        jumps = "a position jump" if self.count == 1 else f"{self.count} position jumps"
-        most, since_s = distance(joint, self.longest), (self.first_ns - begin_ns) * 1e-9
+    def finding(self, row: int, joint: PlannedJoint, begin_ns: int) -> Finding:
+        """Return the finding that the position of joint number `row` jumped; the run begins at `begin_ns`."""
+        number = int(self.number[row])
+        jumps = "a position jump" if number == 1 else f"{number} position jumps"
+        most, since_s = distance(joint, float(self.longest[row])), (int(self.first_ns[row]) - begin_ns) * 1e-9
         text = f"reported {jumps} of up to {most}, faster than its servo model can turn"
         return joint_finding("position_jumped", joint, text, since_s, brief=True)
 
@@ -89,12 +82,16 @@ class Movement:
     ) -> None:
         self._joints = joints
         found = {name.partition("/")[2]: column for column, name in enumerate(references)}
-        columns = [found.get(f"{joint.name}/position", -1) for joint in joints]
-        self._references = {row: column for row, column in enumerate(columns) if column >= 0}
-        """Column of the reference position of each joint that a controller moves with an effort."""
-        self._fastest = np.zeros(len(joints))
-        self._jumps = [_Jumps() for _ in joints]
-        self.bins = Bins(8, len(joints), begin_ns)
+        self._settings = {
+            "share": np.array([joint.share for joint in joints], np.float64),
+            "top_speed": np.array([joint.logged.top_speed or 0.0 for joint in joints], np.float64),
+            "turn_speed": np.array([_turn_speed(joint) for joint in joints], np.float64),
+            "least_jump": np.array([MOVED_RAD * joint.share for joint in joints], np.float64),
+            "reference": np.array([found.get(f"{joint.name}/position", -1) for joint in joints], np.int64),
+            "fastest": np.zeros(len(joints)),
+        }
+        self._jumps = _Jumps.of_joints(len(joints))
+        self.bins = Bins(_QUANTITIES, len(joints), begin_ns)
         self._trail = Trail(len(joints), begin_ns)
 
     def add_cycles(self, columns: JointColumns, way: Floats, known: int) -> None:
@@ -106,106 +103,26 @@ class Movement:
             way: Reachable trajectories, rad or m; shape (joints, cycles).
             known: Number of cycles that were added before.
         """
-        if known >= len(columns):
+        read_ns, count = columns["read_ns"], len(columns) - known
+        if count <= 0:
             return
-        speed, moved = np.full_like(way, np.nan), np.zeros_like(way)
-        np.divide(np.abs(np.diff(way)), columns.steps, out=speed[:, 1:])
-        np.divide(np.abs(np.diff(columns["position"])), columns.steps, out=moved[:, 1:])
-        new = {name: columns[name][..., known:] for name in _FIELDS}
-        way, speed, moved, position = way[:, known:], speed[:, known:], moved[:, known:], new["position"]
-        has_torque = new["torque"] == int(Torque.ON)
-        moves = has_torque & new["valid"]
-        # A joint with an effort goal has no reachable trajectory.
-        by_effort = np.isfinite(new["goal_effort"])
-        driven = moves & ~by_effort
-        free = position if driven.all() else np.where(driven, position, np.nan)
-        self._add_positions(new["read_ns"] - new["age_ns"], free, driven | ~has_torque)
-        error = np.where(np.isfinite(way), free, np.nan) - way
-        unknown = np.isnan(error)
-        hurries = self._hurries(np.nan_to_num(new["velocity"]), error, moved)
-        away = np.abs(error)
-        if hurries is not None:
-            away[hurries] = 0.0
-        off, led = error, way
-        if unknown.any():
-            sought = self._sought(columns, moves & by_effort, known)
-            off, led = np.where(unknown, position - sought, error), np.where(unknown, sought, way)
-        rate = 1e9 / max(float(np.median(np.diff(new["read_ns"]))), 1.0) if position.shape[1] > 2 else 0.0
-        swings = self._swings(off, rate) - self._told(new["goal_position"], led, rate)
-        values = [
-            error,
-            way,
-            free,
-            speed,
-            np.abs(new["effort"]),
-            away,
-            swings,
-            self._swings(new["goal_position"], rate),
-        ]
-        for row, of in enumerate((unknown,) * 6 + (np.isnan(off), unknown)):
-            if of.any():
-                values[row] = np.where(of, np.nan, values[row])
-        self.bins.bin_cycles(new["read_ns"], values)
-        self._trail.add_cycles(new["read_ns"], way.T, free.T, new["effort"].T)
-
-    def _add_positions(self, at_ns: NDArray[np.int64], position: Floats, kept: NDArray[np.bool_]) -> None:
-        """Add positions of all joints with their times, without those that are not `kept`: shape (joints,
-        cycles)."""
-        for row, joint in enumerate(self._joints):
-            mine = slice(None) if kept[row].all() else kept[row]
-            self._jumps[row].add_positions(joint, at_ns[row, mine], position[row, mine])
-
-    def _hurries(self, velocity: Floats, error: Floats, moved: Floats) -> NDArray[np.bool_] | None:
-        """Return where a joint approaches its goal at full speed, and is thus not at fault for its error;
-        None if nowhere."""
-        quick, before = np.abs(velocity), self._fastest[:, None]
-        self._fastest = np.maximum(self._fastest, quick.max(axis=1))
-        top = np.array([[_SLOWEST_TOP * (joint.logged.top_speed or 0)] for joint in self._joints])
-        if not (quick >= _FULL_SPEED * np.maximum(before, top)).any():
-            return None
-        fastest = np.maximum(np.maximum.accumulate(np.hstack([before, quick]), axis=1)[:, 1:], top)
-        hurries: NDArray[np.bool_] = (velocity * error < 0) & (quick >= _FULL_SPEED * fastest)
-        hurries &= moved >= _FULL_SPEED / 2 * quick
-        return hurries
-
-    def _sought(self, columns: JointColumns, by_effort: NDArray[np.bool_], known: int) -> Floats:
-        """Return the reference position of each joint while a controller moves it with an effort, NaN
-        otherwise; shape (joints, cycles)."""
-        sought = np.full(by_effort.shape, np.nan)
-        for row, column in self._references.items():
-            sought[row] = np.where(by_effort[row], columns["reference"][column, known:], np.nan)
-        return sought
-
-    def _swings(self, values: Floats, rate: float) -> Floats:
-        """Return an array (joints, cycles) that has the cycle rate in 1/s where a swing of `values` ends,
-        and 0 elsewhere. Its mean is the number of swings a second."""
-        found = np.zeros_like(values)
-        least = np.array([_SWING_RAD * joint.share for joint in self._joints])
-        # Most joints move less than the smallest swing in a slice
-        extent = np.fmax.reduce(values, axis=1) - np.fmin.reduce(values, axis=1)
-        for row in np.flatnonzero(~(extent < least)).tolist():
-            known = np.flatnonzero(np.isfinite(values[row]))
-            mine = values[row] if len(known) == values.shape[1] else values[row, known]
-            steps = np.diff(mine)
-            moves = np.flatnonzero(steps)  # Goals are constant between commands
-            steps = steps[moves]
-            turns = moves[np.flatnonzero(steps[1:] * steps[:-1] < 0)] + 1
-            far = np.abs(np.diff(mine[turns])) >= least[row]
-            # Only swings without missing cycles in between count.
-            swings = turns[1:][far & (np.diff(known[turns]) == np.diff(turns))]
-            found[row, known[swings]] = rate
-        return found
-
-    def _told(self, goal: Floats, way: Floats, rate: float) -> Floats:
-        """Return an array as of `_swings` for commanded swings: those of the trajectory, and steps of a
-        goal that was constant before, which count as two."""
-        found = self._swings(way, rate)
-        steps = np.abs(np.diff(goal, prepend=np.nan))
-        begins = steps >= np.array([[_SWING_RAD * joint.share] for joint in self._joints])
-        if begins.any():
-            begins[:, 1:] &= steps[:, :-1] == 0.0
-            found = np.maximum(found, np.where(begins, 2.0 * rate, 0.0))
-        return found
+        way = np.ascontiguousarray(way)
+        rate = 1e9 / max(float(np.median(np.diff(read_ns[known:]))), 1.0) if count > 2 else 0.0
+        values, free = np.empty((_QUANTITIES, count)), np.empty((len(way), count))
+        off, led, marks = np.empty((3, count))
+        used = {name: columns[name] for name in _FIELDS}
+        times = {"read_ns": read_ns, "bin": self.bins.find_bins(read_ns[known:]), "steps": columns.steps}
+        numbers = {"count": len(columns), "known": known, "torque_on": int(Torque.ON)}
+        scratch = {"values": values, "off": off, "led": led, "marks": marks, "free": free}
+        structures = (
+            _structure("Cycles", used | times | {"way": way}, rate=rate, **numbers),
+            _structure("Joints", self._settings, count=len(way)),
+            _structure("Jumps", self._jumps._asdict()),
+            _structure("Bins", self.bins.columns, bins=BINS),
+            _structure("Scratch", scratch),
+        )
+        _library().movement_add(*map(ctypes.byref, structures))
+        self._trail.add_cycles(read_ns[known:], way[:, known:].T, free.T, columns["effort"][:, known:].T)
 
     def findings(self, reached_off: Mapping[str, float] = _NONE) -> Iterable[Finding]:
         """Report joints that stand still, oscillate, or follow worse than before, and positions that jumped.
@@ -223,9 +140,9 @@ class Movement:
         together = shared > max(1, len(found) // 2)
         named: set[int] = set()
         for row, (one, failing) in enumerate(found):
-            if self._jumps[row].count:
-                yield self._jumps[row].finding(one.joint, self.bins.begin_ns)
-            if self._jumps[row].count or failing is not None:
+            if self._jumps.number[row]:
+                yield self._jumps.finding(row, one.joint, self.bins.begin_ns)
+            if self._jumps.number[row] or failing is not None:
                 named.add(row)
             if failing is None or (failing.shared and together):
                 continue
@@ -256,3 +173,19 @@ class Movement:
             Windows(joint, length_s, *(each[:, :, row] for each in values))
             for row, joint in enumerate(self._joints)
         ]
+
+
+def _turn_speed(joint: PlannedJoint) -> float:
+    top = joint.logged.top_speed
+    return math.nan if top is None or joint.wraps else top
+
+
+def _structure(name: str, columns: Mapping[str, NDArray[Any]], **numbers: float) -> ctypes.Structure:
+    return _STRUCTS[name](**{key: one.ctypes.data for key, one in columns.items()}, **numbers)
+
+
+@cache
+def _library() -> ctypes.CDLL:
+    found = load_compiled(SOURCE, ctypes.CDLL)
+    found.movement_add.argtypes, found.movement_add.restype = (ctypes.c_void_p,) * 5, None
+    return found
