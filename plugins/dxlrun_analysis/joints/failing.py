@@ -157,23 +157,22 @@ def _still(one: Windows) -> FollowingFailure | None:
     away = one.mean[AWAY] > AWAY_RAD * one.joint.share
     found = None
     begin, low, high = 0, math.inf, -math.inf
+    lows, highs = least.tolist(), most.tolist()
     for at in range(len(least) + 1):
-        if at < len(least) and max(high, most[at]) - min(low, least[at]) <= near:
-            low, high = min(low, least[at]), max(high, most[at])
+        if at < len(least) and max(high, highs[at]) - min(low, lows[at]) <= near:
+            low, high = min(low, lows[at]), max(high, highs[at])
             continue
-        when = np.zeros(len(least), np.bool_)
-        when[begin:at] = True
-        seconds = float((away & when).sum()) * one.length_s
-        if (
-            seconds >= max(_STILL_S, found.seconds if found else 0.0)
-            and one.compute_range(WAY, when) >= moves
-            and np.nanmax(np.abs([one.least[ERROR, when], one.most[ERROR, when]])) >= moves
-        ):
-            there = when | (away & (least >= low - near) & (most <= high + near))
-            found = _stood(one, when, there, float((there & away).sum()) * one.length_s)
+        seconds = float(away[begin:at].sum()) * one.length_s
+        if seconds >= max(_STILL_S, found.seconds if found else 0.0):
+            when = np.zeros(len(least), np.bool_)
+            when[begin:at] = True
+            error = [one.least[ERROR, when], one.most[ERROR, when]]
+            if one.compute_range(WAY, when) >= moves and np.nanmax(np.abs(error)) >= moves:
+                there = when | (away & (least >= low - near) & (most <= high + near))
+                found = _stood(one, when, there, float((there & away).sum()) * one.length_s)
         begin, low, high = at, math.inf, -math.inf
-        if at < len(least) and most[at] - least[at] <= near:
-            low, high = least[at], most[at]
+        if at < len(least) and highs[at] - lows[at] <= near:
+            low, high = lows[at], highs[at]
         else:
             begin = at + 1
     return found
@@ -240,17 +239,19 @@ def _worse(one: Windows) -> FollowingFailure | None:
     """Return the windows in which a joint follows worse than ever before, as a failure; None if too short."""
     away = one.mean[AWAY]
     bad, well, before = (np.zeros(len(away), np.bool_) for _ in range(3))
-    follows = True
+    follows, count, worst = True, 0, 0.0  # Number of windows `before`, and the worst error in them
     for at in range(len(away)):
         if not away[at] >= 0:  # Without torque: the joint must catch up first
             follows = False
             continue
         follows = follows or bool(away[at] <= AWAY_RAD * one.joint.share)
-        bad[at] = follows and before.sum() >= _FEWEST and _is_worse(one, at, before)
-        doubtful = before.sum() >= _FEWEST and away[at] > _DOUBTFUL * away[before].max()
+        bad[at] = follows and count >= _FEWEST and _is_worse(one, at, before, worst)
+        doubtful = count >= _FEWEST and away[at] > _DOUBTFUL * worst
         well[at] = follows and not (doubtful and away[at] > AWAY_RAD * one.joint.share / 2)
         if at and well[at]:  # The window before a bad one can contain its start
             before[at - 1] = well[at - 1]
+            if well[at - 1]:
+                count, worst = count + 1, max(worst, away[at - 1])
     seconds = float(bad.sum()) * one.length_s
     if seconds < BAD_S:
         return None
@@ -262,9 +263,9 @@ def _worse(one: Windows) -> FollowingFailure | None:
     return FollowingFailure("follows_worse", text + one.load_text(bad, before), bad, seconds, shared=True)
 
 
-def _is_worse(one: Windows, at: int, before: Flags) -> bool:
+def _is_worse(one: Windows, at: int, before: Flags, worst: float) -> bool:
     away, speed, load = (one.mean[row] for row in (AWAY, SPEED, LOAD))
-    there, worst = AWAY_RAD * one.joint.share, away[before].max()
+    there = AWAY_RAD * one.joint.share
     if not away[at] > max(there, WORSE * worst):
         return False
     new = one.least[WAY, at] < one.least[WAY, before].min() - there

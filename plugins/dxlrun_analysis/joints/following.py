@@ -127,8 +127,10 @@ class FollowedJoint(NamedTuple):
         )
         begins, ends = self.at_s[starts].tolist(), self.at_s[starts + lengths - 1].tolist()
         uneven = np.logical_or.reduceat(self._bends(), starts).tolist()
-        # Stays by place and direction: end (s), speed, highest similar speed, error and load.
-        usual: dict[tuple[int, int], list[tuple[float, float, float, float, float]]] = defaultdict(list)
+        # Stays by place and direction: end (s), speed, highest similar speed, error, and load if known.
+        usual: dict[tuple[int, int], list[tuple[float, float, float, float, float | None]]] = defaultdict(
+            list
+        )
         stays = zip(place[starts].tolist(), direction[starts].tolist(), strict=True)
         for row, ((here, way), is_known) in enumerate(zip(stays, known[starts].tolist(), strict=True)):
             if not is_known:
@@ -142,9 +144,9 @@ class FollowedJoint(NamedTuple):
                 if until_s < at_s - _AGAIN_S and one <= quickest and quick <= its_quickest
             ]
             was = _nearest(off, [each for each, _ in before])
-            took = _nearest(load, [each for _, each in before if math.isfinite(each)])
+            took = _nearest(load, [each for _, each in before if each is not None])
             if len(before) < _MOST_BEFORE and abs(off - was) < least and not abs(load - took) >= least_load:
-                usual[here, way].append((end_s, quick, quickest, off, load))
+                usual[here, way].append((end_s, quick, quickest, off, load if math.isfinite(load) else None))
             if before:
                 seconds, middle = end_s - at_s + self.step_s, (here + 0.5) * _PLACE_RAD
                 yield Visit(at_s, seconds, middle, off, was, load, took, not uneven[row], way)

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from dxlrun import Floats, Log
 from dxlrun_analysis.finding import Finding, cause
 from dxlrun_analysis.joints.bins import Bins
+from dxlrun_analysis.joints.joint_columns import JointColumns
 from dxlrun_analysis.joints.planned import PlannedJoint, planned_joints
 from dxlwire import Fault
 
@@ -75,10 +76,12 @@ class ServoHealth:
             self._bins = Bins(len(_QUANTITIES), len(log.joints), int(cycles["read_ns"][0]))
             self._faults = [set() for _ in log.joints]
             self._volts = np.full(len(log.joints), np.nan)
-        self._bins.bin_cycles(cycles["read_ns"], [cycles[name].T for name in _QUANTITIES])
-        for joint, faults, values in zip(self._joints, self._faults, cycles["hardware_error"].T, strict=True):
-            for value in np.unique(values).tolist():
-                faults.update(joint.faults(value))
+        columns = JointColumns(cycles)
+        self._bins.bin_cycles(columns["read_ns"], [columns[name] for name in _QUANTITIES])
+        # Hardware errors are rare.
+        for row in np.flatnonzero(columns["hardware_error"].any(axis=1)).tolist():
+            for value in np.unique(columns["hardware_error"][row]).tolist():
+                self._faults[row].update(self._joints[row].faults(value))
         self._keep_volts(cycles)
 
     def _keep_volts(self, cycles: NDArray[np.void]) -> None:
