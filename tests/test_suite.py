@@ -283,7 +283,7 @@ def test_sdist_has_every_file_of_its_folders(built: Path) -> None:
 def test_sdist_has_nothing_of_an_environment_in_its_folder(tmp_path: Path) -> None:
     for name in ("pyproject.toml", "README.md", "LICENSE", "hatch_build.py"):
         shutil.copy(ROOT / name, tmp_path)
-    for name in ("ros/lib/runtime/module.py", "ros/lib/LICENSE", "docs/page.md"):
+    for name in ("ros/lib/runtime/module.py", "ros/lib/LICENSE", "docs/explanation/architecture.md"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).touch()
     ran = run("-m", "hatchling", "build", "--target", "sdist", folder=tmp_path)
@@ -291,7 +291,7 @@ def test_sdist_has_nothing_of_an_environment_in_its_folder(tmp_path: Path) -> No
     (archive,) = tmp_path.glob("dist/*.tar.gz")
     with tarfile.open(archive) as tar:
         packed = {name.partition("/")[2] for name in tar.getnames()}
-    assert "docs/page.md" in packed
+    assert "docs/explanation/architecture.md" in packed
     assert not any(name.startswith("ros/") for name in packed)
 
 
