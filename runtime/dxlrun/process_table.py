@@ -134,10 +134,16 @@ def found_runs() -> list[FoundRun]:
 
 
 def start_directories() -> set[str]:
-    """Return XDG_RUNTIME_DIR of each process that reads a robot file for a run, and so has no plan yet."""
+    """Return XDG_RUNTIME_DIR of each process that reads a robot file for a run, and so has no plan yet.
+
+    Processes of other users are not among them.
+    """
     found = set()
     for folder in PROC.iterdir():
-        if not folder.name.isdigit() or not _reads_robot_file(folder):
+        # The command lines of other users can be read, but not whether their runs have a plan.
+        if not folder.name.isdigit() or not os.access(folder / "fd", os.R_OK):
+            continue
+        if not _reads_robot_file(folder):
             continue
         stat = read_stat(folder)
         if stat is not None and not stat.is_dead and not stat.is_stopped and robot_of(folder) is None:
@@ -205,8 +211,13 @@ def _executes_dxlrun(process: Path) -> bool:
 
 
 def _reads_robot_file(process: Path) -> bool:
-    """Return whether a command line is `dxlrun ROBOT.yaml`, of a run that clients can steer."""
+    """Return whether a command line is `dxlrun ROBOT.yaml`, of a run that clients can steer.
+
+    It begins with Python, unlike that of a parent such as `uv run` or `timeout`, which never has a plan.
+    """
     words = _words(process)
     names = [os.path.basename(word) for word in words[:3]]
-    file = words[names.index(b"dxlrun") + 1 :][:1] if b"dxlrun" in names else []
+    if not names or not names[0].startswith(b"python") or b"dxlrun" not in names:
+        return False
+    file = words[names.index(b"dxlrun") + 1 :][:1]
     return any(one.endswith((b".yaml", b".yml")) for one in file) and not _UNSTEERED & {*words}

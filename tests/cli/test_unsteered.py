@@ -14,7 +14,10 @@ import pytest
 from tests.kit.awaited import DEADLINE_S
 from tests.kit.commands import Dxlrun
 
-from dxlrun.channels.heartbeat import GatewayAvailability, Phase
+from dxlrun import process_table
+from dxlrun.channels.heartbeat import GatewayAvailability, Phase, is_starting
+from dxlrun.process_table import SUPERVISOR as SUPERVISOR_ROLE
+from dxlrun.process_table import FoundRun, ProcessStat, RunProcess
 from dxlrun.remote.sockets import await_sockets, create_listener
 from dxlrun.run.unsteered import unsteered_runs
 
@@ -45,6 +48,7 @@ print("ready", flush=True)
 while True:
     signal.pause()
 """
+NO_GATEWAY = "runs but cannot be steered: it has no gateway; end it by `dxlrun stop"
 LOST = "it has no supervisor and no guardian and no gateway"
 
 
@@ -86,14 +90,11 @@ def test_loop_without_the_rest_of_its_run_is_named_and_ended(dxlrun: Dxlrun, beg
 @pytest.mark.parametrize(
     ("phase", "steering", "said"),
     [
-        (Phase.LOADING, GatewayAvailability.IMPOSSIBLE, "is starting; try again when it runs"),
+        (Phase.LOADING, GatewayAvailability.IMPOSSIBLE, NO_GATEWAY),
         (Phase.RUNNING, GatewayAvailability.AWAITED, "is starting; try again when it runs"),
-        (
-            Phase.RUNNING,
-            GatewayAvailability.IMPOSSIBLE,
-            "runs but cannot be steered: it has no gateway; end it by `dxlrun stop",
-        ),
+        (Phase.RUNNING, GatewayAvailability.IMPOSSIBLE, NO_GATEWAY),
         (Phase.DONE, GatewayAvailability.POSSIBLE, "is ending"),
+        (Phase.DONE, GatewayAvailability.IMPOSSIBLE, "is ending"),
     ],
 )
 def test_only_a_run_without_a_gateway_gets_the_advice_to_stop_it(
@@ -129,6 +130,43 @@ def test_client_waits_while_a_robot_starts(
     assert ([*found], waits) == ([] if ends else ["young_arm"], ["slept"])
     for each in listeners:
         each.close()
+
+
+@pytest.mark.parametrize(
+    ("words", "found"),
+    [
+        ("/usr/bin/python3 /home/me/bin/dxlrun arm.yaml", True),
+        ("python3.12 -m dxlrun arm.yaml port:=sim", True),
+        ("python3 dxlrun arm.yaml --virtual", False),
+        ("python3 dxlrun check arm.yaml", False),
+        ("uv run dxlrun arm.yaml", False),
+        ("timeout 60 dxlrun arm.yaml", False),
+        ("", False),
+    ],
+)
+@pytest.mark.parametrize("readable", [True, False])
+def test_client_waits_for_no_parent_of_a_run_and_no_process_of_another_user(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: str, *, found: bool, readable: bool
+) -> None:
+    """The descriptors of another user's process cannot be read, so its run would never get a plan."""
+    for name in ("12", "self"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "cmdline").write_text("\0".join(words.split()))
+        (tmp_path / name / "stat").write_text(f"12 (python3) S{' 1' * 20}")
+        (tmp_path / name / "environ").write_text("XDG_RUNTIME_DIR=/run/user/7")
+        if readable:
+            (tmp_path / name / "fd").mkdir()
+    monkeypatch.setattr(process_table, "PROC", tmp_path)
+    assert process_table.start_directories() == ({"/run/user/7"} if found and readable else set())
+
+
+@pytest.mark.parametrize("role", [SUPERVISOR_ROLE, "gateway"])
+def test_run_with_a_stopped_process_does_not_start(role: str) -> None:
+    states = {SUPERVISOR_ROLE: "S", "gateway": "S"}
+    for state, starts in (("S", True), ("T", False)):
+        found = (states | {role: state}).items()
+        processes = tuple(RunProcess(0, each, ProcessStat(letter, 1, 1)) for each, letter in found)
+        assert is_starting(FoundRun("arm", processes, "")) == starts
 
 
 @pytest.mark.parametrize("stopped", ["loop", "supervisor"])

@@ -48,9 +48,8 @@ class Replies(NamedTuple):
     exchange: Numbers  # Index in the exchanges
     servo: Numbers
     place: Numbers  # Place in the replies that the instruction requests; -1: not requested
-    took_us: (
-        Numbers  # From before the write() of the instruction to `last_ns`; 0 for a reply that does not answer
-    )
+    took_us: Numbers
+    """From before the write() of the instruction to `last_ns`; 0 for a reply that does not answer."""
     wire_ns: Numbers  # Wire time of the status packet
     last_ns: Numbers  # After the read() of the status packet's last byte
     before_ns: Numbers

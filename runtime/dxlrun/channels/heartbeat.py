@@ -105,15 +105,13 @@ def is_ending(run: FoundRun) -> bool:
 
 
 def is_starting(run: FoundRun) -> bool:
-    """Return whether a run will accept commands soon: its supervisor responds, and its loop or its gateway is
-    not ready yet.
-    """
-    supervisor, heartbeat = run.process(SUPERVISOR), read_heartbeat(run)
+    """Return whether a run will accept commands soon: its supervisor responds, its gateway will listen."""
+    supervisor, gateway, heartbeat = run.process(SUPERVISOR), run.process("gateway"), read_heartbeat(run)
     if supervisor is None or supervisor.stat.is_stopped or is_ending(run):
         return False
-    if heartbeat is None or heartbeat.phase is not Phase.RUNNING:
-        return True
-    return heartbeat.steering is GatewayAvailability.AWAITED
+    if gateway is not None and gateway.stat.is_stopped:
+        return False
+    return heartbeat is None or heartbeat.steering is GatewayAvailability.AWAITED
 
 
 def create() -> int:

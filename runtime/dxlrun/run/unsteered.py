@@ -108,7 +108,7 @@ def _problem(run: FoundRun) -> str:
         if gateway is not None and gateway.stat.is_stopped:
             return f"its {gateway} is stopped"
         heartbeat = read_heartbeat(run)
-        if heartbeat is None or heartbeat.phase is not Phase.RUNNING:
+        if heartbeat is None or is_ending(run):
             return ""
         return "it has no gateway" if heartbeat.steering is GatewayAvailability.IMPOSSIBLE else ""
     steering = (SUPERVISOR, "guardian", "loop", "gateway")
