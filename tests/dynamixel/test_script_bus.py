@@ -138,6 +138,13 @@ def test_eeprom_is_written_only_where_it_differs_and_without_torque(script):
     assert written(script.sent(), 11) == []
 
 
+def test_each_servo_of_a_group_gets_another_id(script):
+    servos = script.bus.scan()
+    script.sent()
+    servos.write("id", [4, 5, 6])
+    assert written(script.sent(), 7) == [(1, 4), (2, 5), (3, 6)]
+
+
 @pytest.mark.parametrize(
     ("item", "value", "words"),
     [

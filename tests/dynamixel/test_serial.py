@@ -445,11 +445,12 @@ def test_remedy_is_for_the_machine_first_and_never_for_simulated_parts(port, loa
 def test_late_start_names_the_timer_that_the_kernel_shows(tmp_path, found, named):
     if found is not None:
         timer_of(tmp_path, "ttyUSB7", found)
-    sentence = describe_late_start("main", "/dev/ttyUSB7", [15 * MS, 0, 14 * MS], MS, tmp_path)
+    sentence = describe_late_start("main", "/dev/ttyUSB7", [15 * MS, MS, 14 * MS], MS, tmp_path)
     assert sentence.startswith(
         "2 of 3 replies on bus main were delayed by up to 15 ms (planned for the adapter: 1 ms)"
     )
-    assert ("the adapter's latency timer is 16 ms: shorten it with `echo 1 | sudo tee" in sentence) is named
+    assert ("latency timer" in sentence) is named
+    assert not named or "the adapter's latency timer is 16 ms: shorten it with `echo 1 | sudo tee" in sentence
 
 
 ENDLESS_NS = 1 << 62  # nothing is due to the host

@@ -109,9 +109,8 @@ class FirstFailure:
 
 def run_session(tests: Sequence[str], omitted: Sequence[str], question: Connection) -> None:
     """Run tests in this process, without a word, and send what failed first."""
-    sys.dont_write_bytecode = True  # a fault of the same size in the same second would not be read
-    signal.signal(signal.SIGINT, signal.default_int_handler)
     sys.dont_write_bytecode = True  # it counts for each text of a file that has its size and second
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     with open(os.devnull, "w") as nowhere:
         os.dup2(nowhere.fileno(), 1)
         os.dup2(nowhere.fileno(), 2)

@@ -433,6 +433,14 @@ EXPECTATIONS: dict[str, Callable[..., object]] = {
     r"writes (\d+): (.+)": lambda case, servo_id, addresses: case.expect_ids(
         [address for one, address, _ in case.rig.writes() if one == int(servo_id)], addresses
     ),
+    r"wrote (\d+) (\d+): (.+)": lambda case, servo_id, address, values: case.expect_ids(
+        [
+            int.from_bytes(data, "little")
+            for *written, data in case.rig.writes()
+            if written == [int(servo_id), int(address)]
+        ],
+        values,
+    ),
     r"mode (\d+): (\w+)": Case.expect_mode,
     r"(\d+) is at (\S+) deg": Case.expect_place,
     r"error (\d+): (\d+)": Case.expect_error,

@@ -11,6 +11,7 @@ import sys
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -39,6 +40,14 @@ def test_clients_that_hang_do_not_keep_others_out(door):
 
     assert door.open(act) >= 20
     assert [command.kind for command in door.desk.taken] == ["stop"]
+
+
+@pytest.mark.parametrize(("user", "accepted"), [(0, True), (1000, True), (1001, False)])
+def test_other_users_of_this_computer_are_refused(user, accepted, monkeypatch):
+    monkeypatch.setattr(os, "getuid", lambda: 1000)
+    end = SimpleNamespace(getsockopt=lambda *_: server._CREDENTIALS.pack(7, user, 0))
+    client = server._client(SimpleNamespace(get_extra_info=lambda _: end), {})
+    assert (client is not None) is accepted
 
 
 FLOOD = """
