@@ -144,6 +144,12 @@ def test_reached_waits_for_torque_and_replies_but_not_for_ever(story, torque, va
     assert (story.reports[-1][1].joint, story.reports[-1][1].text) == ("j0", f"after 1.000 s, joint j0 {why}")
 
 
+def test_a_joint_that_was_lost_settles_from_its_return_on(story):
+    lost, doubt, sure = map(story.torque, (Torque.LOST, Torque.DOUBT, Torque.ON))
+    story.run(90, {2: [story.moves(1), lost], 40: doubt, 70: sure})
+    assert story.timed == [(2, "accepted"), (70, "reached")]
+
+
 def test_the_topic_has_feedback_ten_times_a_second_between_acceptance_and_result(story, monkeypatch):
     messages = []
 

@@ -28,7 +28,7 @@ from dxlsim.bus.simulated_bus import PacketFault, SimulatedBus
 from dxlsim.simulation_plan import ServoConfig
 from dxlwire.bus_plan import BusPlan
 from dxlwire.exchange.bus_engine import Lines
-from dxlwire.exchange.owed import LEAST_WINDOW_NS, SLOW_MEMORY_NS, OwedReplies
+from dxlwire.exchange.owed import LEAST_WINDOW_NS, MOST_WINDOW_NS, SLOW_MEMORY_NS, OwedReplies
 from dxlwire.plan.line import MOST_SPARE
 from dxlwire.plan.retry import ReplyLateness, extend_timeouts, retry
 from dxlwire.transaction import Program, Reply, Transaction
@@ -249,6 +249,11 @@ def test_slow_reply_widens_the_window_for_a_minute(owed, clock):
     assert owed.window_ns == slow_ns * 5 // 4
     clock.now_ns += 1
     assert owed.window_ns == LEAST_WINDOW_NS
+    for slow_ms in (740, 920, 1140, 1420):
+        owed.add(READ_TORQUE, 0, clock.now_ns)
+        clock.now_ns += slow_ms * MILLISECOND_NS
+        owed.charge_reply(11, 1, 0)
+    assert owed.window_ns == MOST_WINDOW_NS
 
 
 @pytest.mark.parametrize("register", [64, 65])

@@ -286,7 +286,10 @@ def test_a_sensor_whose_noise_does_not_show_is_stuck_until_it_changes():
 STUCK: dict[str, tuple[list[tuple[float, float, float]], int]] = {
     "one noisy value changes": ([(1.0, 0.1 * (turn % 2), 0.01) for turn in range(100)], 100),
     "a chip with a dead band at rest": ([(0.1, 0.2, 0.01), (0.0, 0.0, 3.0)], 301),
-    "it measures each 250 ms": ([*((0.1 * turn, 2.0, 0.25) for turn in range(1, 9)), (0.9, 2.0, 1.2)], 300),
+    "it measures each 250 ms, once after 20 ms": (
+        [*((0.1 * turn, 2.0, 0.25) for turn in range(1, 9)), (0.85, 2.0, 0.02), (0.9, 2.0, 1.2)],
+        302,
+    ),
     "it never changes": ([(1.0, 2.0, 2.2)], 200),
 }
 """Samples and for how long, s; and how many of them are valid at least."""
@@ -303,6 +306,8 @@ def test_a_sensor_is_stuck_only_after_more_equal_samples_than_before(case):
 
 def test_few_equal_samples_many_of_a_fast_poll_and_no_noise_are_no_sign():
     slow, polled = Desk(noisy=STATES), Desk(noisy=STATES)
+    slow.sample(0.9)
+    slow.cycle(20)
     for _ in range(19):  # 380 ms
         slow.sample(1.0)
         assert slow.cycle(20)[1]
