@@ -34,24 +34,26 @@ def recorded(log):
     return RecordedRobot(log)
 
 
-@pytest.fixture(scope="package")
+@pytest.fixture(scope="session")
 def run(tmp_path_factory):
+    """A torso that runs until the last test of this process; `live` alone lets a test find it."""
     one = Run(tmp_path_factory.mktemp("live"))
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_RUNTIME_DIR", str(one.place))
         one.start()
-        yield one
-        one.end()
+    yield one
+    one.end()
 
 
 @pytest.fixture
-def live(run):
+def live(run, monkeypatch):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(run.place))
     robot = LiveRobot("bioloid_torso_imu")
     yield robot
     robot.close()
 
 
-@pytest.fixture(scope="package")
+@pytest.fixture(scope="session")
 def chromium(tmp_path_factory):
     if CHROMIUM is None:
         pytest.skip("no Chromium is installed; apt install chromium")
