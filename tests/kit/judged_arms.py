@@ -150,20 +150,26 @@ def six_axis(*, more: bool = False) -> Arm:
     steps = [("0 0 0.1", "0 0 1"), ("0 0 0.05", "0 1 0"), ("0 0 0.2", "0 1 0"), ("0.05 0 0", "1 0 0"),
              ("0.2 0 0", "0 1 0"), ("0 0 0", "1 0 0")]  # fmt: skip
     steps[2:2] = [("0 0 0.1", "0 0 1")] * more
-    text = '<robot name="six"><link name="l0"/>'
-    for number, (origin, axis) in enumerate(steps):
+    return _built("seven" if more else "six", [("revolute", 2.9, *step) for step in steps])
+
+
+def _built(name: str, steps: list[tuple[str, float, str, str]]) -> Arm:
+    """Return an arm whose joints have a type, a limit on both sides, an origin and an axis."""
+    text = f'<robot name="{name}"><link name="l0"/>'
+    for number, (kind, limit, origin, axis) in enumerate(steps):
         text += (
-            f'<link name="l{number + 1}"/><joint name="j{number}" type="revolute"><parent link="l{number}"/>'
+            f'<link name="l{number + 1}"/><joint name="j{number}" type="{kind}"><parent link="l{number}"/>'
             f'<child link="l{number + 1}"/><origin xyz="{origin}"/><axis xyz="{axis}"/>'
-            '<limit lower="-2.9" upper="2.9" effort="1" velocity="4"/></joint>'
+            f'<limit lower="{-limit}" upper="{limit}" effort="1" velocity="4"/></joint>'
         )
     count = len(steps)
     text += (
         f'<link name="tip"/><joint name="end" type="fixed"><parent link="l{count}"/><child link="tip"/>'
         '<origin xyz="0.1 0 0"/></joint></robot>'
     )
+    limits = tuple(limit for _, limit, *_ in steps)
     names = tuple(f"j{number}" for number in range(count))
-    return Arm("seven" if more else "six", text, "l0", "tip", names, (-2.9,) * count, (2.9,) * count)
+    return Arm(name, text, "l0", "tip", names, tuple(-limit for limit in limits), limits)
 
 
 def arms() -> dict[str, Arm]:
@@ -176,5 +182,10 @@ def arms() -> dict[str, Arm]:
         example("poppy_ergo_jr", "base_link", "tip", "m1", "m2", "m3", "m4", "m5", "m6"),
         six_axis(),
         six_axis(more=True),
+        _built("sliding", [
+            ("revolute", 2.9, "0 0 0.1", "0 0 1"), ("prismatic", 0.2, "0 0 0.05", "0 0 1"),
+            ("revolute", 2.0, "0.1 0 0", "0 1 0"), ("prismatic", 0.15, "0.1 0 0", "1 0 0"),
+            ("revolute", 2.9, "0.05 0 0", "1 0 0"),
+        ]),
     ]  # fmt: skip
     return {arm.name: arm for arm in found}

@@ -364,7 +364,7 @@ def test_twists_into_singularities_and_limits_are_held(name: str) -> None:
     assert np.abs(np.diff(rows[180:200], axis=0)).max() < 2e-3, "stretched out, it rests"
 
 
-@pytest.mark.parametrize("name", ["open_manipulator_x", "koch", "six", "op3"])
+@pytest.mark.parametrize("name", ["open_manipulator_x", "koch", "six", "op3", "sliding"])
 @campaign(ci=2, night=20, release=200)
 def test_all_limits_hold_for_twists_beside_singularities(
     name: str, number: int, chance: random.Random

@@ -13,7 +13,7 @@ from tests.kit.judged_arms import Arm, apart, arms, as_pose, six_axis
 from dxlrun_space.path import MotionLimits, plan_joints
 from dxlrun_space.solver import Solver
 
-NAMES = ("open_manipulator_x", "koch", "op3", "poppy_ergo_jr", "six", "seven")
+NAMES = ("open_manipulator_x", "koch", "op3", "poppy_ergo_jr", "six", "seven", "sliding")
 MOST_STEPS = 1000  # 0.3 s of planning
 SPEED, RATE = 4.0, 20.0  # rad/s, rad/s^2
 all_arms = cache(arms)
