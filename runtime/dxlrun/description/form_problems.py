@@ -464,12 +464,14 @@ def _only_key(error: _Error) -> str:
     if form is None or error.input is None:
         return ""
     takes = keys_for(form, error.input)
-    meant = [name for name in takes if form.model_fields[name].is_required()]
-    if not meant and isinstance(error.input, str | list):  # many keys take a number
-        meant = takes
+    required = {name for name, info in form.model_fields.items() if info.is_required()}
+    if required:
+        meant = [name for name in takes if name in required]
+    else:
+        meant = takes if isinstance(error.input, str | list) else []  # many keys take a number
     if len(meant) != 1:
         return ""
-    more = ", ..." * any(info.is_required() for name, info in form.model_fields.items() if name != meant[0])
+    more = ", ..." * (len(required) > 1)
     return f"write `{error.path[-1]}: {{{meant[0]}: {yaml_text(error.input)}{more}}}`"
 
 
