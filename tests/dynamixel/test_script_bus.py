@@ -158,6 +158,8 @@ def test_each_servo_of_a_group_gets_another_id(script):
         ("present_position", 1.0, r"Present Position \(132\) of XM430-W350 is read-only"),
         ("torque_enable", 1, "use `servos.torque = True`"),
         ("goal_positon", 1.0, "has no item 'goal_positon'; did you mean goal_position"),
+        (116, 1.0, r"has no item 116; did you mean goal_position\?"),  # Its address
+        (9999, 1.0, "has no item 9999; known: "),
     ],
 )
 def test_wrong_values_are_refused_before_a_byte_is_sent(script, item, value, words):

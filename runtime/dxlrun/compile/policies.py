@@ -232,8 +232,8 @@ def _too_long(file: RobotFile, policy: Policy, name: str, limit_ns: int) -> None
     origin = " from the farthest limit" if slowest.targets else ""
     file.error(
         file.at("policies", name),
-        f"{name} may take {policy.longest_ns * 1e-9:.1f} s ({slowest.text}: up to "
-        f"{slowest.longest_ns * 1e-9:.1f} s{origin}), but exit_timeout {timeout_ns * 1e-9:g} s leaves "
-        f"{max(limit_ns, 0) * 1e-9:.1f} s",
+        f"{name} may take {policy.longest_ns * 1e-9:.2f} s ({slowest.text}: up to "
+        f"{slowest.longest_ns * 1e-9:.2f} s{origin}), but exit_timeout {timeout_ns * 1e-9:g} s leaves "
+        f"{max(limit_ns, 0) * 1e-9:.2f} s",
         f"raise exit_timeout to {-(-needed_s * 10 // 1) / 10:g} s, or shorten its steps",
     )

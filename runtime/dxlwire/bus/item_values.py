@@ -26,7 +26,11 @@ def item_of(table: ControlTable, name: str) -> ControlItem:
         LookupError: The model has no such item.
     """
     if name not in table.items:
-        raise LookupError(f"{table.model} has no item {name!r}; {suggestion(name, table.items)}")
+        # A script of another library names an item by its address.
+        at_address = {str(item.address): item.name for item in table.items.values()}
+        meant = at_address.get(str(name), str(name))
+        hint = suggestion(meant, table.items) if meant not in table.items else f"did you mean {meant}?"
+        raise LookupError(f"{table.model} has no item {name!r}; {hint}")
     item = table.items[name]
     if name not in _POSITIONS:
         return item

@@ -90,20 +90,23 @@ def check_samples(
             f"{limits_of(joints[joint])}",
             "the gate holds the joint at the limit; change the motion or the limits",
         )
-    for joint, (speed, t_ns, mark) in fastest.items():
-        report_speed(joints[joint], speed, f" at {(start_ns + t_ns) * 1e-9:.3f} s", mark, problems)
+    for joint, (speed, t_ns, mark, stated) in fastest.items():
+        where = f" at {(start_ns + t_ns) * 1e-9:.3f} s"
+        report_speed(joints[joint], speed, where, mark, problems, stated=stated)
 
 
-def report_speed(joint: JointPlan, speed: float, where: str, mark: Mark, problems: Problems) -> None:
+def report_speed(
+    joint: JointPlan, speed: float, where: str, mark: Mark, problems: Problems, *, stated: bool = False
+) -> None:
     """Add a problem if a file asks a joint for too much speed: an error above the servo's top speed.
 
     Above the joint's limit alone it is a warning: the gate limits the speed, so the joint is late.
     """
-    excess = excess_speed(joint, speed, where)
+    excess = excess_speed(joint, speed, where, stated=stated)
     if excess is None:
         return
     if excess.beyond_servo:
-        problems.error(mark, excess.text, f"{excess.fix}, or shorten the way")
+        problems.error(mark, excess.text, excess.fix if stated else f"{excess.fix}, or shorten the way")
     else:
         fix = f"the gate limits the speed, so the joint is late; {excess.fix}, or raise the limit"
         problems.warning(mark, excess.text, fix)
@@ -118,10 +121,11 @@ class ExcessSpeed(msgspec.Struct, frozen=True):
     """True if the speed is above the servo's own top speed, not only above the file's limit."""
 
 
-def excess_speed(joint: JointPlan, speed: float, where: str) -> ExcessSpeed | None:
+def excess_speed(joint: JointPlan, speed: float, where: str, *, stated: bool = False) -> ExcessSpeed | None:
     """Compare a speed, rad/s or m/s, with a joint's highest; None if the joint can reach it.
 
-    All speeds in files and in clients' requests are compared here.
+    All speeds in files and in clients' requests are compared here. More time does not lower a `stated` speed,
+    which is a number in a file.
     """
     most, top = joint.highest_speed, joint.top_speed
     if abs(speed) <= most * (1 + _ROUNDING):
@@ -133,6 +137,9 @@ def excess_speed(joint: JointPlan, speed: float, where: str) -> ExcessSpeed | No
     shown = top if beyond_servo and top is not None and not register else most
     unit = joint.unit.speed
     text = f"{joint.name} is commanded to {speed:.4g} {unit}{where}, more than {shown:.4g} {unit}, {limit}"
+    if stated:
+        allowed = math.floor(most * 1000 + 1e-6) / 1000  # Rounded to the nearest it could be refused again
+        return ExcessSpeed(text, f"lower the velocity to at most {allowed:g} {unit}", beyond_servo)
     fix = "allow more time"
     if 0 < abs(speed) < _MOST_LONGER * most:
         fix += f", {math.ceil(100 * abs(speed) / most - 1e-6) / 100:g} times as long"
@@ -141,21 +148,24 @@ def excess_speed(joint: JointPlan, speed: float, where: str) -> ExcessSpeed | No
 
 def _worst(
     samples: Sequence[MotionSample], joints: Mapping[str, JointPlan], peaks: Iterable[SpeedPeak]
-) -> tuple[dict[str, tuple[float, MotionSample, float]], dict[str, tuple[float, int, Mark]]]:
-    """Return by joint the target farthest outside the limits, and the highest speed with its time."""
-    farthest: dict[str, tuple[float, MotionSample, float]] = {}
-    fastest: dict[str, tuple[float, int, Mark]] = {}
+) -> tuple[dict[str, tuple[float, MotionSample, float]], dict[str, tuple[float, int, Mark, bool]]]:
+    """Return by joint the target farthest outside the limits, and the highest speed with its time.
 
-    def note_speed(joint: str, speed: float, t_ns: int, mark: Mark) -> None:
-        if abs(speed) > fastest.get(joint, (0.0, 0, mark))[0]:
-            fastest[joint] = abs(speed), t_ns, mark
+    The last value of a speed is True if the file states it.
+    """
+    farthest: dict[str, tuple[float, MotionSample, float]] = {}
+    fastest: dict[str, tuple[float, int, Mark, bool]] = {}
+
+    def note_speed(joint: str, speed: float, t_ns: int, mark: Mark, *, stated: bool) -> None:
+        if abs(speed) > fastest.get(joint, (0.0, 0, mark, stated))[0]:
+            fastest[joint] = abs(speed), t_ns, mark, stated
 
     for sample in samples:
         for joint, target in sample.targets.items():
             if joint not in joints:
                 continue
             if target.velocity is not None:
-                note_speed(joint, target.velocity, sample.t_ns, target.mark)
+                note_speed(joint, target.velocity, sample.t_ns, target.mark, stated=True)
             if target.position is None:
                 continue
             excess = max(joints[joint].lower - target.position, target.position - joints[joint].upper)
@@ -167,7 +177,7 @@ def _worst(
         # Report a peak at the target toward which the joint moves.
         aimed = samples[min(bisect_left(times, t_ns), len(times) - 1)].targets.get(peak.joint)
         if peak.joint in joints and aimed is not None:
-            note_speed(peak.joint, peak.speed, t_ns, aimed.mark)
+            note_speed(peak.joint, peak.speed, t_ns, aimed.mark, stated=False)
     return farthest, fastest
 
 
