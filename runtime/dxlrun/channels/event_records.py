@@ -217,7 +217,9 @@ class GoalTotals(msgspec.Struct, frozen=True):
     begun: dict[str, int] = {}
     """Number of accepted goals of motion files, by their position in the file."""
     failed: tuple[GoalReport, ...] = ()
-    """Missed and aborted goals: the first hundred of motion files, and the first hundred of clients."""
+    """Missed and aborted goals, without those refused to a client: the first hundred of motion files, and the
+    first hundred of clients.
+    """
     allowed: dict[str, float] = {}
     """Largest distance from the target at the end of a reached goal, by joint, rad or m."""
 
@@ -252,14 +254,15 @@ class GoalHistory:
     def count_report(self, report: GoalReport) -> None:
         """Count a goal's event by its status, and store a failed goal, up to MOST_FAILED."""
         planned = report.origin in self.planned
+        refused = report.refused and not planned
         self._counts[report.status] += 1
-        self._counts["refused"] += report.refused and not planned
+        self._counts["refused"] += refused
         if report.status == "accepted" and planned:
             self._begun[report.origin] += 1
         if report.status == "reached" and report.joint and report.error is not None:
             before = self._allowed.get(report.joint, 0.0)
             self._allowed[report.joint] = max(before, report.error)
-        if report.status in ("missed", "aborted") and self._kept[planned] < MOST_FAILED:
+        if report.status in ("missed", "aborted") and not refused and self._kept[planned] < MOST_FAILED:
             self._kept[planned] += 1
             self._failed.append(report)
 
