@@ -233,6 +233,8 @@ _OF_ROBOT = ("robot", "file", "config", "f")
 """Names that other programs give to their option for the robot file, which is positional here."""
 _SIMULATED = ("sim", "simulate", "simulated", "simulation")
 """Names that other programs give to their option for simulated servos."""
+_FIRST = {"torque": "on|off", "servo": "/.*"}
+"""Verb -> pattern of its first word, which people write last, too: the state, or the port."""
 
 
 def _right_form(error: CycloptsError, tokens: Sequence[str]) -> str:
@@ -258,15 +260,10 @@ def _right_form(error: CycloptsError, tokens: Sequence[str]) -> str:
 
 
 def _in_order(verb: Sequence[str], given: Sequence[str]) -> str:
-    """Return the command line with the state of `torque` or the port of `servo` as its first word."""
-    early = [
-        word
-        for word in given[1:]
-        if {"torque": word in ("on", "off"), "servo": word[:1] == "/"}.get(" ".join(verb))
-    ]
-    if not early:
-        return ""
-    return shlex.join(("dxlrun", *verb, early[0], *(word for word in given if word != early[0])))
+    """Return the command line with the word that `_FIRST` describes as the first one; empty without one."""
+    form = _FIRST.get(" ".join(verb))
+    early = next((word for word in given[1:] if form and re.fullmatch(form, word)), "")
+    return shlex.join(("dxlrun", *verb, early, *(word for word in given if word != early))) if early else ""
 
 
 def _parts(word: str, sign: str) -> list[str]:
