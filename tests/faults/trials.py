@@ -26,6 +26,7 @@ from coverage import CoverageData
 from tests.faults import faults
 from tests.faults.faults import ROOT, Fault
 from tests.kit import selection
+from tests.kit.nested import forget_outer_pytest
 
 LIMIT_S = 120.0
 FORK = multiprocessing.get_context("fork")
@@ -115,7 +116,9 @@ def run_session(tests: Sequence[str], omitted: Sequence[str], question: Connecti
         os.dup2(nowhere.fileno(), 1)
         os.dup2(nowhere.fileno(), 2)
     failure = FirstFailure()
-    pytest.main([*WORDS, *tests, *(f"--deselect={test}" for test in omitted)], plugins=[failure])
+    with pytest.MonkeyPatch.context() as patch:
+        forget_outer_pytest(patch)
+        pytest.main([*WORDS, *tests, *(f"--deselect={test}" for test in omitted)], plugins=[failure])
     question.send(failure.name)
 
 

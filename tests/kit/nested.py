@@ -23,6 +23,12 @@ class Ran(NamedTuple):
         return self.out.splitlines()[-1]
 
 
+def forget_outer_pytest(patch: pytest.MonkeyPatch) -> None:
+    """Hide the options of the pytest that runs this from one that runs in it."""
+    for name in [name for name in os.environ if name.startswith(("PYTEST", "COV_"))]:
+        patch.delenv(name)
+
+
 def run_pytest(folder: Path, files: dict[str, str], *words: str) -> Ran:
     """Run pytest as in a shell whose directory is a folder with these files, a conftest and its settings."""
     conftest = (ROOT / "tests/conftest.py").read_text()
@@ -31,8 +37,7 @@ def run_pytest(folder: Path, files: dict[str, str], *words: str) -> Ran:
         (folder / name).write_text(text)
     modules, path, here = dict(sys.modules), [*sys.path], Path.cwd()
     with pytest.MonkeyPatch.context() as patch:
-        for name in [name for name in os.environ if name.startswith(("PYTEST", "COV_"))]:
-            patch.delenv(name)
+        forget_outer_pytest(patch)
         patch.setenv("PYTHONPATH", str(ROOT))  # of workers
         patch.chdir(folder)
         output = io.StringIO()
