@@ -28,7 +28,7 @@ CASES = {
     f"check {ROBOT}": (("check", ROBOT), 2.8),
     f"{ROBOT} --virtual --duration 0.1": ((ROBOT, "--virtual", "--duration", "0.1"), 3.7),
 }
-"""What is typed after `dxlrun`, and the highest ratio to the import.
+"""Words after `dxlrun`, and the highest ratio to the import.
 
 The libraries alone, with one pydantic model, are 1.7. The bounds are 7 % above the ratios of a quiet machine.
 """

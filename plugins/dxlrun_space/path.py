@@ -54,7 +54,7 @@ class MotionLimits(msgspec.Struct, frozen=True):
 
 
 class NoPath(Exception):
-    """Raised if there is no path, with the reason and the remaining distance."""
+    """Raised if no path is found; its text has the reason and the remaining distance."""
 
 
 class Path:

@@ -23,7 +23,6 @@ _ROLES = {
     b"dxlrun.log.recorder": "recorder",
     b"dxlrun.remote": "gateway",
 }
-_UNSTEERED = {b"--virtual", b"--no-gateway"}
 KIND = "--kind"
 """Command-line argument of a feature's process; the next argument is its role."""
 
@@ -211,7 +210,7 @@ def _executes_dxlrun(process: Path) -> bool:
 
 
 def _reads_robot_file(process: Path) -> bool:
-    """Return whether a command line is `dxlrun ROBOT.yaml`, of a run that clients can steer.
+    """Return whether a command line is `dxlrun ROBOT.yaml`, of a run in real time.
 
     It begins with Python, unlike that of a parent such as `uv run` or `timeout`, which never has a plan.
     """
@@ -220,4 +219,4 @@ def _reads_robot_file(process: Path) -> bool:
     if not names or not names[0].startswith(b"python") or b"dxlrun" not in names:
         return False
     file = words[names.index(b"dxlrun") + 1 :][:1]
-    return any(one.endswith((b".yaml", b".yml")) for one in file) and not _UNSTEERED & {*words}
+    return any(one.endswith((b".yaml", b".yml")) for one in file) and b"--virtual" not in words

@@ -175,9 +175,9 @@ def test_servos_without_a_robot_file_answer_and_take_planned_and_typed_faults(
 def test_programs_of_the_page_run_against_the_servos_of_the_page(start: Start, tmp_path: Path) -> None:
     link = str(tmp_path / "robot")
     (words,) = re.findall(r"^    dxlrun sim (--servo XL430.+)$", page_text("simulation.md"), re.MULTILINE)
+    (place,) = re.findall(r"--link (\S+)", words)
     words, *programs = (
-        text.replace("/tmp/robot", link)  # noqa: S108
-        for text in (words, *page_blocks("simulation.md", "python"))
+        text.replace(place, link) for text in (words, *page_blocks("simulation.md", "python"))
     )
     sim = start(*words.split(), "--json")
     assert sim.result()["ports"] == {"main": link}

@@ -5,6 +5,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -125,11 +126,20 @@ def test_client_waits_while_a_robot_starts(
             listeners.append(create_listener("young_arm")[0])
 
     listeners: list[socket.socket] = []
-    monkeypatch.setattr("dxlrun.remote.sockets.time", SimpleNamespace(sleep=sleep))
+    monkeypatch.setattr("dxlrun.remote.sockets.time", SimpleNamespace(sleep=sleep, monotonic=time.monotonic))
     found = await_sockets("young_arm")
     assert ([*found], waits) == ([] if ends else ["young_arm"], ["slept"])
     for each in listeners:
         each.close()
+
+
+def test_client_gives_up_a_start_that_hangs(monkeypatch: pytest.MonkeyPatch) -> None:
+    passed = [0.0]
+    clock = SimpleNamespace(sleep=lambda _: passed.append(passed[-1] + 50.0), monotonic=lambda: passed[-1])
+    monkeypatch.setattr("dxlrun.remote.sockets.time", clock)
+    monkeypatch.setattr("dxlrun.remote.sockets._is_starting", lambda robot: True)
+    assert await_sockets("hung_arm") == {}
+    assert passed == [0.0, 50.0, 100.0, 150.0]
 
 
 @pytest.mark.parametrize(

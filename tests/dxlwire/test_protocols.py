@@ -24,7 +24,7 @@ INSTRUCTIONS_1 = {
 
 
 def parsed(packet, dialect=p1):
-    """Return the status of a whole packet; None: header, length or checksum are wrong, or it is no status."""
+    """Return the status in a packet; None if a part of the packet is wrong, or if it has another type."""
     view = memoryview(bytes(packet))
     whole = packet.startswith(dialect.HEADER) and dialect.size_at(view, 0, len(view)) == len(view)
     return dialect.opened(view) if whole and dialect.intact(view) else None

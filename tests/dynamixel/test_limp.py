@@ -219,7 +219,7 @@ def owed(clock: SimpleNamespace) -> OwedReplies:
             READ_TORQUE,
             True,
         ),
-        # a reading from before a write is no answer, however often it was repeated
+        # a reading from before a write does not answer the one after it
         ([(MISS, READ_TORQUE, 1), (WRITE, LIMP, 2), (MISS, READ_TORQUE, 3)], READ_TORQUE, True),
         ([(MISS, READ_TORQUE, 1), (WRITE, ALL_LIMP, 2)], READ_TORQUE, True),
         # a late acknowledgement counts for the repetition of its write, unless another came between

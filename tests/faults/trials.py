@@ -4,8 +4,8 @@
     python tests/faults/faults.py --try control.txt
 
 The tests that execute the function of the fault in the process of pytest run; where there are none, those of
-its room, and those that name its module. A test that fails without the fault too has not found it, and what
-takes longer than the limit finds nothing: nobody would wait for it.
+its room, and those that name its module. A test that fails without the fault too, or
+takes longer than the limit, has not found it.
 """
 
 import ast

@@ -10,14 +10,13 @@
 #define SOURCE_CRC 0 /* CRC-32 of this file: movement.py rejects an object of another version */
 #endif
 
-#define QUANTITIES 8    /* failing.py */
 #define JUMP_S 0.5      /* positions further apart are not compared: the joint may have been moved by hand */
 #define TOO_FAST 1.25   /* a supply at its limit and a pulling load make a servo slightly faster than its model */
 #define SWING_RAD 0.035 /* 2 deg: smallest swing that counts */
 #define FULL_SPEED 0.8  /* a joint moves as fast as it can from this share of its greatest speed so far on */
 #define SLOWEST_TOP 0.4 /* share of the model's top speed that a joint reaches with a weak supply and a load */
 
-enum { ERROR, WAY, POSITION, SPEED, LOAD, AWAY, SWINGS, GOALS }; /* failing.py */
+enum { ERROR, WAY, POSITION, SPEED, LOAD, AWAY, SWINGS, GOALS, QUANTITIES }; /* in the order of failing.py */
 
 typedef struct {
     const int64_t *read_ns, *age_ns, *bin; /* `bin` of each cycle */

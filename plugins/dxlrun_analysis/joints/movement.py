@@ -25,6 +25,7 @@ from dxlrun_analysis.joints.bins import BINS, Bins
 from dxlrun_analysis.joints.failing import (
     AWAY,
     AWAY_RAD,
+    GOALS,
     MOVED_RAD,
     WORSE,
     Windows,
@@ -44,7 +45,7 @@ _FIELDS = (
 )
 """Fields of the cycles that `movement.c` uses, of each joint."""
 _WINDOW_S = 0.5  # Length of the long windows
-_QUANTITIES = 8  # Rows of `Windows` and `Bins`
+_QUANTITIES = GOALS + 1  # Rows of `Windows` and `Bins`
 SOURCE = Path(__file__).with_name("movement.c")
 _STRUCTS = parse_structs(SOURCE.read_text())
 

@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Set
 from contextlib import suppress
 from types import UnionType
-from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 from pydantic import BaseModel, Tag, ValidationError
 from pydantic_core import ErrorDetails
@@ -431,8 +431,11 @@ def _remedy(error: _Error, marks: Marks) -> str:
     if expected in ("a mapping", "a list") and (fix := _indentation(error) or _only_key(error)):
         return fix
     if error.kind in ("literal_error", "enum"):
-        options = re.findall(r"'([^']*)'", str(error.context["expected"]))
-        return suggestion(str(error.input), options, "write one of them")
+        at = None if error.model is None else _without_none(_annotation_at(error.model, error.location))
+        options = (*get_args(at),) if get_origin(at) is Literal else ()
+        return suggestion(
+            str(error.input), [one for one in options if isinstance(one, str)], "write one of them"
+        )
     written = plain_value(error.input) if isinstance(error.input, str) else None
     if isinstance(written, int | float) and expected in (_WHOLE, _NUMBER, _BOOL):
         return "remove the quotes" if expected != _WHOLE or isinstance(written, int) else _REMEDIES[_WHOLE]

@@ -39,6 +39,8 @@ _ENDING_S = 1.0
 LONGEST_PATH = 107
 """Longest path of a Unix socket on Linux, bytes without the terminating zero (unix(7))."""
 _START_POLL_S = 0.05
+LONGEST_START_S = 120.0
+"""Longest time, s, for which a client waits for a start, which may take a minute on a busy machine."""
 
 
 def sockets_directory(runtime_directory: str | None = None) -> Path:
@@ -160,14 +162,14 @@ def sockets() -> dict[str, Path]:
 
 
 def await_sockets(robot: str | None) -> dict[str, Path]:
-    """Return `sockets()`; wait first while a robot starts that is not among them yet.
+    """Return `sockets()`; wait first, at most two minutes, while a robot starts that is not among them yet.
 
     Args:
         robot: Name of the robot; None: any robot.
     """
-    found = sockets()
+    found, end_s = sockets(), time.monotonic() + LONGEST_START_S
     while not (found if robot is None else robot in found):
-        if not _is_starting(robot):
+        if time.monotonic() >= end_s or not _is_starting(robot):
             return sockets()  # a run that is not starting any more may run by now
         time.sleep(_START_POLL_S)
         found = sockets()
