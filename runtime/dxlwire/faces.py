@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from importlib import import_module
 
 TYPE_CHECKING = False  # Importing typing, collections and functools takes longer than the face itself
 if TYPE_CHECKING:
@@ -32,6 +31,9 @@ def lazy_face(module: str, source: str) -> tuple[Callable[[str], object], Callab
         return homes
 
     def get_attribute(name: str) -> object:
+        # Imported here, as a Ctrl-C during the import of this module is still Python's own traceback.
+        from importlib import import_module
+
         if name == "__all__":
             return list(read_homes())
         if name not in read_homes():

@@ -86,6 +86,14 @@ def beneath(modules: set[str], *packages: str) -> set[str]:
     return {name for name in modules if any(f"{name}.".startswith(f"{each}.") for each in packages)}
 
 
+def test_a_command_line_takes_interrupts_after_few_imports() -> None:
+    before, after = (
+        {*printed(f"import json, sys{more}; print(json.dumps([*sys.modules]))")}
+        for more in ("", ", dxlrun.cli")
+    )
+    assert after - before <= {"__future__", "gc", "dxlrun", "dxlrun.cli", "dxlwire", "dxlwire.faces"}
+
+
 def test_what_needs_no_robot_imports_neither_numpy_nor_pydantic() -> None:
     (version, general), _ = after("--version", "--help")
     (check, pause, unknown), _ = after("check --help", "pause --help", "no_such_verb")

@@ -110,7 +110,12 @@ def test_only_a_run_without_a_gateway_gets_the_advice_to_stop_it(
 @pytest.mark.parametrize("early", [True, False])
 @pytest.mark.parametrize("ends", [True, False])
 def test_client_waits_while_a_robot_starts(
-    begin: Begin, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, *, early: bool, ends: bool
+    begin: Begin,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    *,
+    early: bool,
+    ends: bool,
 ) -> None:
     """Early: the process still reads the robot file, so the robot's name is not known yet."""
     awaited = {"PHASE": int(Phase.LOADING), "STEERING": int(GatewayAvailability.AWAITED)}
@@ -129,17 +134,21 @@ def test_client_waits_while_a_robot_starts(
     monkeypatch.setattr("dxlrun.remote.sockets.time", SimpleNamespace(sleep=sleep, monotonic=time.monotonic))
     found = await_sockets("young_arm")
     assert ([*found], waits) == ([] if ends else ["young_arm"], ["slept"])
+    assert caplog.messages == ["waiting for young_arm, which is starting"]
     for each in listeners:
         each.close()
 
 
-def test_client_gives_up_a_start_that_hangs(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_client_gives_up_a_start_that_hangs(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     passed = [0.0]
     clock = SimpleNamespace(sleep=lambda _: passed.append(passed[-1] + 50.0), monotonic=lambda: passed[-1])
     monkeypatch.setattr("dxlrun.remote.sockets.time", clock)
     monkeypatch.setattr("dxlrun.remote.sockets._is_starting", lambda robot: True)
     assert await_sockets("hung_arm") == {}
     assert passed == [0.0, 50.0, 100.0, 150.0]
+    assert caplog.messages == ["waiting for hung_arm, which is starting"]
 
 
 @pytest.mark.parametrize(

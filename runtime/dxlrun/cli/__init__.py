@@ -8,7 +8,11 @@ from __future__ import annotations
 import gc
 import os
 import sys
-from collections.abc import Sequence
+
+# Ctrl-C during these imports is still Python's own traceback, so they are few.
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
 __all__ = ["main"]
 
@@ -18,7 +22,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     0 good, 1 the robot or the run failed, 2 the input is wrong, 130 interrupted.
     """
-    _open_standard_streams()
     if arguments is not None:
         return _run(tuple(arguments))
     # Only in our own process: a start creates 100,000 to 150,000 permanent objects. One garbage collection of
@@ -36,6 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(tokens: tuple[str, ...]) -> int:
     try:
+        _open_standard_streams()
         # The framework takes longer to import than the output takes to print.
         if tokens == ("--version",):
             from dxlrun.cli.help import version

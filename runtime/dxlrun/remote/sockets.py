@@ -164,13 +164,20 @@ def sockets() -> dict[str, Path]:
 def await_sockets(robot: str | None) -> dict[str, Path]:
     """Return `sockets()`; wait first, at most two minutes, while a robot starts that is not among them yet.
 
+    A wait is logged once as a warning, which Python prints to stderr where a program configures no logging.
+
     Args:
         robot: Name of the robot; None: any robot.
     """
-    found, end_s = sockets(), time.monotonic() + LONGEST_START_S
+    found, is_reported, end_s = sockets(), False, time.monotonic() + LONGEST_START_S
     while not (found if robot is None else robot in found):
         if time.monotonic() >= end_s or not _is_starting(robot):
             return sockets()  # a run that is not starting any more may run by now
+        if not is_reported:
+            import logging  # a running robot is found without it
+
+            is_reported = True
+            logging.getLogger(__name__).warning("waiting for %s, which is starting", robot or "a robot")
         time.sleep(_START_POLL_S)
         found = sockets()
     return found

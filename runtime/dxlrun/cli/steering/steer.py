@@ -17,7 +17,7 @@ from cyclopts import Parameter
 from dxlrun.cli.inputs import DebugFlag, GraphFile, Hertz, JsonFlag, WaitFlag
 from dxlrun.errors import DxlrunError, InputError, suggestion
 from dxlrun.output.quantity import names_with_units, quantity_text
-from dxlrun.output.terminal import err, print_error, show_json, show_parts
+from dxlrun.output.terminal import print_error, show_json, show_parts
 from dxlrun.output.text_table import Column, Columns, Table
 
 if TYPE_CHECKING:
@@ -323,8 +323,7 @@ def connect_robot(name: str | None, verb: str) -> RemoteRobot:
 
     names, remote = running(), () if name is None else known_robots()
     if not (names if name is None else name in (*names, *remote) or "@" in name):
-        with err().status(f"waiting for {name or 'a robot'}, if it is starting"):
-            names = tuple(sorted(await_sockets(name)))
+        names = tuple(sorted(await_sockets(name)))
     known = (*names, *remote)
     missing = name not in known if name else not names
     if missing and (run := unsteered_of(name)) is not None:
