@@ -23,7 +23,7 @@ def test_the_runs_are_shown_in_a_table_and_the_rate_in_a_sentence(
     def run_robot(plan: Plan, *_: object) -> RunSummary:
         path = tmp_path / f"{len(list(tmp_path.iterdir()))}.mcap"
         VirtualRobot(plan, log=path).run()
-        return RunSummary(0, "ended", 1, 0, 0.1, (), log=str(path))
+        return RunSummary(0, "ended", 1, 0, (), log=str(path))
 
     monkeypatch.setattr(highest_rate, "run_robot", run_robot)
     said = dxlrun("bench", "rate", ROBOT, "--duration", "0.3")

@@ -138,7 +138,7 @@ def test_bus_md(
 
     def run_robot(plan: Any, options: RunOptions, out: object) -> RunSummary:
         ports.extend(one.port for one in plan.buses)
-        return RunSummary(0, "ended", 1, 0, 0.1, ())
+        return RunSummary(0, "ended", 1, 0, ())
 
     monkeypatch.setattr("dxlrun.run.supervisor.run_robot", run_robot)
     typed(dxlrun, run)

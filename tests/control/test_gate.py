@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from tests.kit.loops import PERIOD_NS, GateRig
 
 from dxlrun.channels.cycle import Clamp, Torque
+from dxlrun.channels.event_records import CommandOutside
 from dxlrun.control.gate import BACK_SPEED, CLAMP_ENDS_NS
 from dxlrun.plan.loop_plan import JointPlan, ServoLimit, SourcePlan
 from dxlrun.plan.policy_plan import SLOW_SPEED, SLOW_START_NS
@@ -555,6 +556,7 @@ def test_a_clamp_has_one_event_at_its_beginning_and_one_after_its_end():
     ]
     rig.apply(position=3.0)
     assert len(rig.texts) == 5
+    assert rig.gate.outside == (CommandOutside(0, 3.0, 5),)
 
 
 LIGHT = SourcePlan(

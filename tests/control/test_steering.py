@@ -37,7 +37,8 @@ def left():
 
 
 def test_the_event_of_a_long_command_shows_only_its_begin(left):
-    left.run(5, {2: [left.asks("pause"), left.loads("extra" * 30, **LEFT)]})
+    result = left.run(5, {2: [left.asks("pause"), left.loads("extra" * 30, **LEFT)]})
+    assert (result.cycles, result.paused) == (5, 3)
     paused, text = left.events.texts(EventCode.STEERED)
     assert paused == "pause from anna"
     assert text.startswith("load extraextra")

@@ -381,6 +381,16 @@ class EventGroup(msgspec.Struct, frozen=True):
         return Event(self.t_ns, self.code, self.severity, self.source, self.text).name
 
 
+class CommandOutside(msgspec.Struct, frozen=True):
+    """Position commands of one joint outside of its limits, which the gate clamped."""
+
+    row: int
+    """Row of the joint in the plan."""
+    first: float
+    """First such command, rad or m."""
+    cycles: int
+
+
 class EventCounts:
     """Counts events by kind, severity and source, so that memory stays bounded."""
 

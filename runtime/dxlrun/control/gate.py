@@ -17,7 +17,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from dxlrun.channels.cycle import Clamp, CycleRecord, Floats
-from dxlrun.channels.event_records import EventSink
+from dxlrun.channels.event_records import CommandOutside, EventSink
 from dxlrun.control import texts
 from dxlrun.plan.loop_plan import JointPlan, LimitedInterface, LoopPlan, ServoLimit
 from dxlrun.plan.policy_plan import SLOW_SPEED, SLOW_START_NS
@@ -47,6 +47,7 @@ _WHAT = {
     Clamp.PWM: "held to the full voltage",
     Clamp.OUTWARD: "stopped at the position limit",
 }
+_POSITION_LIMITS = (Clamp.LOWER, Clamp.UPPER)
 _LIMITED: Mapping[Clamp, LimitedInterface] = {
     Clamp.VELOCITY: "velocity",
     Clamp.EFFORT: "effort",
@@ -122,6 +123,8 @@ class Gate:
         self._joints = _laid_out(plan.joints)
         self.counts: NDArray[np.int64] = self._joints["counts"]
         self._begun, self._before = np.zeros((2, count), dtype=np.uint8)
+        self._outside: dict[int, float] = {}
+        """First position command outside of the limits, by row of the joint."""
         self._now_ns = 0  # Sum of the times between cycles
         self._clamps: dict[tuple[int, int], _ReportedClamp] = {}
         """Clamps whose begin was reported and whose end was not, by clamp bit and row of the joint."""
@@ -252,12 +255,20 @@ class Gate:
                 if (bit.value, row) in self._clamps:
                     continue
                 name = self._plan.joints[row].name
+                if bit in _POSITION_LIMITS:
+                    self._outside.setdefault(row, self._record.commands.position.item(row))
                 # A fallback may command the joint by now. The fault's own event names the controller.
                 owner = "" if bit is Clamp.NOT_FINITE else self._owner(name)
                 own = self._limited[row].find_servo_limit(_LIMITED[bit]) if bit in _LIMITED else None
                 what_by = f"clamped by register {own.text}" if own else what
                 self._clamps[bit.value, row] = _ReportedClamp(what_by, self._now_ns, self._now_ns)
                 self._events.emit_event(name, texts.goal_clamped(name, owner, what_by))
+
+    @property
+    def outside(self) -> tuple[CommandOutside, ...]:
+        """Joints with position commands outside of their limits."""
+        cycles = self.counts[:, [bit.bit_length() - 1 for bit in _POSITION_LIMITS]].sum(axis=1)
+        return tuple(CommandOutside(row, first, cycles.item(row)) for row, first in self._outside.items())
 
     def _report_ended(self) -> None:
         bits = self._record.clamped

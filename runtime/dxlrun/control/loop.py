@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dxlrun.channels.commands import LOOP, OWN_ORIGIN, TakenCommand
 from dxlrun.channels.cycle import CycleRecord, Torque
-from dxlrun.channels.event_records import EventSink
+from dxlrun.channels.event_records import CommandOutside, EventSink
 from dxlrun.control import texts
 from dxlrun.control.context import ControlContext
 from dxlrun.control.controllers.activity import is_interrupt
@@ -56,6 +56,9 @@ class LoopResult(msgspec.Struct, frozen=True):
     invalid: tuple[int, ...] = ()
     """Number of cycles with an invalid servo state, a value for each joint. Requested reboots do not
     count."""
+    paused: int = 0
+    """Number of the elapsed periods in which the loop was paused."""
+    outside: tuple[CommandOutside, ...] = ()
 
 
 class ControlLoop:
@@ -140,7 +143,16 @@ class ControlLoop:
             reason, detail = "fault", detail or sentence
         last = self._wind_up(policy)
         self._log_end(reason, detail)
-        return LoopResult(self._cycles, self._skipped, reason, detail, last, tuple(self._invalid.tolist()))
+        return LoopResult(
+            self._cycles,
+            self._skipped,
+            reason,
+            detail,
+            last,
+            tuple(self._invalid.tolist()),
+            self._paused_cycles,
+            self.gate.outside,
+        )
 
     # Inside
 

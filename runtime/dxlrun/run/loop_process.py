@@ -24,7 +24,7 @@ from msgspec.json import Decoder
 from dxlrun.channels import child_processes
 from dxlrun.channels.child_processes import LineLost, LineReturned, MessageChannel
 from dxlrun.channels.commands import CommandRing
-from dxlrun.channels.event_records import EventRing, EventSink, EventTotals, SimulationStall
+from dxlrun.channels.event_records import CommandOutside, EventRing, EventSink, EventTotals, SimulationStall
 from dxlrun.channels.heartbeat import GatewayAvailability, Heartbeat, Phase
 from dxlrun.channels.kept import KeptStates
 from dxlrun.channels.logged_packets import PacketBatch
@@ -70,6 +70,8 @@ class LoopOutcome(msgspec.Struct, frozen=True):
     traceback: str = ""
     invalid: tuple[int, ...] = ()
     """Number of cycles with an invalid servo state, a value for each joint."""
+    paused: int = 0
+    outside: tuple[CommandOutside, ...] = ()
     events: EventTotals = EventTotals()
     refused_for_replies: bool = False
     """True when the start was refused because of late or missing replies."""
@@ -301,6 +303,8 @@ def _run(plan: Plan, job: LoopJob, heartbeat: Heartbeat, sinks: Sinks, stalls: S
         (*detail, *robot.failures),
         remarks,
         invalid=result.invalid,
+        paused=result.paused,
+        outside=result.outside,
     )
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import msgspec
 
-from dxlrun.channels.event_records import EventCode, EventGroup, EventTotals, Severity
+from dxlrun.channels.event_records import CommandOutside, EventCode, EventGroup, EventTotals, Severity
 from dxlrun.dynamixel.remedies import free_machine
 from dxlrun.errors import counted
 from dxlrun.output.terminal import live_line, show_parts
@@ -76,7 +76,6 @@ class RunSummary(msgspec.Struct, frozen=True):
     reason: str
     cycles: int
     skipped: int
-    elapsed_s: float
     sentences: tuple[str, ...]
     """Errors, one sentence each; empty after a good run."""
     remarks: tuple[str, ...] = ()
@@ -86,6 +85,9 @@ class RunSummary(msgspec.Struct, frozen=True):
     """Number of messages in the log."""
     invalid: tuple[int, ...] = ()
     """Number of cycles with an invalid servo state, a value for each joint."""
+    paused: int = 0
+    """Number of the elapsed periods in which the loop was paused."""
+    outside: tuple[CommandOutside, ...] = ()
     events: EventTotals = EventTotals()
     virtual: bool = False
     """True for a run in virtual time."""
@@ -160,9 +162,10 @@ def run_verdict(run: RunSummary, plan: Plan) -> RunVerdict:
         after_s = max(one.t_ns - events.started_ns, 0) / 1e9
         what = f"{one.source} took over the robot: " if one.code == EventCode.TAKEOVER else ""
         happened.append(f"at {after_s:.1f} s {what}{last_line(one)}")
-    ran_ns = (run.cycles + run.skipped) * loop.period_ns
+    ran_ns = (run.cycles + run.skipped - run.paused) * loop.period_ns
+    paused = f" and was paused for {run.paused * loop.period_ns / 1e9:.1f} s" if run.paused else ""
     without = f" without {', '.join(plan.omitted)}" if plan.omitted else ""
-    happened.append(f"ran for {ran_ns / 1e9:.1f} s{without}")
+    happened.append(f"ran for {ran_ns / 1e9:.1f} s{without}{paused}")
     if events.goals and events.goals.asked:
         asked = counted(events.goals.asked, "goal", "goals")
         happened.append(f"{events.goals.reached} of {asked} reached")
@@ -176,6 +179,7 @@ def run_verdict(run: RunSummary, plan: Plan) -> RunVerdict:
         sentences.append(f"States were invalid: {shares} of the cycles.")
     elif run.invalid and not any(run.invalid):
         sentences.append("The states of all joints were valid in every cycle.")
+    sentences += _commands_outside(run, plan)
     unreached = list(find_unreached_goals(loop, events.goals, ran_ns)) if events.goals else []
     if events.goals is None and any(command.goal for command in loop.commands):
         read = f"; dxlrun analyze {run.log} reads it from the log" if run.log else ""
@@ -201,6 +205,16 @@ def last_line(group: EventGroup) -> str:
     """Return the last line of a group's event text (of a traceback, the exception) without full stop."""
     lines = group.text.strip().splitlines() or [group.name]
     return lines[-1].removesuffix(".")
+
+
+def _commands_outside(run: RunSummary, plan: Plan) -> Iterator[str]:
+    """Yield a sentence for each joint whose position commands were outside of its limits."""
+    for one in run.outside[:_MOST]:
+        joint, cycles = plan.loop.joints[one.row], counted(one.cycles, "cycle", "cycles")
+        yield (
+            f"{joint.name} was commanded to {one.first:.4g} {joint.unit.si}, outside of its limits "
+            f"{joint.lower:.4g}..{joint.upper:.4g} {joint.unit.si}; clamped in {cycles}."
+        )
 
 
 def _rate(run: RunSummary, plan: Plan) -> tuple[bool, str]:

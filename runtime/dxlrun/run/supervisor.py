@@ -40,6 +40,7 @@ from dxlrun.control.realtime_grants import Grant
 from dxlrun.control.sampled_sources import PlannedProcess, planned_processes
 from dxlrun.errors import ProcessFault, counted
 from dxlrun.log.schemas import FAILURES_NAME, CycleSpan, LogClosed, epoch_offset_ns
+from dxlrun.output.terminal import show_parts
 from dxlrun.plan.machine_load import MachineLoad
 from dxlrun.plan.robot_plan import Plan
 from dxlrun.run import source_process, texts
@@ -459,12 +460,12 @@ def run_robot(plan: Plan, options: RunOptions, out: Console) -> RunSummary:
     """
     kept = read_states(plan, state_directory(plan))
     run = _Run(plan, options, create_memory(plan, kept), out, kept)
-    began = time.monotonic()
+    if not out.is_terminal:
+        show_parts(f"{plan.robot}: starting", console=out)
     with caught_signals(run.count_signal):
         try:
             with out.status(f"{plan.robot}: starting") as status:
                 guardian = run.start_processes()
-                began = time.monotonic()
                 run.watch_guardian(guardian, _watching(RunStatusLine(plan, status)))
         finally:
             run.end_processes()
@@ -472,7 +473,7 @@ def run_robot(plan: Plan, options: RunOptions, out: Console) -> RunSummary:
                 run.discard()
             if options.debug:
                 sys.stderr.write(child_processes.whole(run.memory.stderr).decode(errors="replace"))
-    return _summary(run, time.monotonic() - began)
+    return _summary(run)
 
 
 def _watching(progress: RunStatusLine) -> Callable[[Heartbeat], None]:
@@ -487,7 +488,7 @@ def _watching(progress: RunStatusLine) -> Callable[[Heartbeat], None]:
     return show_phase
 
 
-def _summary(run: _Run, elapsed_s: float) -> RunSummary:
+def _summary(run: _Run) -> RunSummary:
     """Return the summary of a run, with exit code 0 good, 1 failed, 130 interrupted."""
     outcome = loop_outcome(run.memory)
     heartbeat = Heartbeat(run.memory.heartbeat)
@@ -509,12 +510,13 @@ def _summary(run: _Run, elapsed_s: float) -> RunSummary:
         reason="interrupted" if interrupted else outcome.reason,
         cycles=outcome.cycles,
         skipped=outcome.skipped,
-        elapsed_s=elapsed_s,
         sentences=tuple(sentences),
         remarks=(*refusals(run.grants, run.out), *outcome.remarks, *run.remarks),
         log=str(run.log) if run.log and run.log.exists() else None,
         messages=run.messages,
         invalid=outcome.invalid,
+        paused=outcome.paused,
+        outside=outcome.outside,
         events=outcome.events,
         refused_for_replies=outcome.refused_for_replies,
         start_up_load=run.closed.start_up_load if run.closed else MachineLoad(),

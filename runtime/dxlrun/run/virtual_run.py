@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import time
 import traceback
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -263,7 +262,6 @@ def run_virtual(plan: Plan, plugins: PlugIns, options: RunOptions, out: Console)
         if log:
             discard_log(log)
         raise
-    began = time.monotonic()
     refused: tuple[str, ...] = ()
     with caught_signals(partial(_stop, robot.stop)), out.status(f"{plan.robot}: starting") as status:
         robot.sinks.progress = RunStatusLine(plan, status, virtual=True).ran
@@ -285,12 +283,13 @@ def run_virtual(plan: Plan, plugins: PlugIns, options: RunOptions, out: Console)
         reason="interrupted" if interrupted else result.reason,
         cycles=result.cycles,
         skipped=result.skipped,
-        elapsed_s=time.monotonic() - began,
         sentences=sentences,
         remarks=(*((TORQUE_STAYS,) if result.last == "hold" else ()), *robot.unkept),
         log=str(log) if log and log.exists() else None,
         messages=robot.messages,
         invalid=result.invalid,
+        paused=result.paused,
+        outside=result.outside,
         virtual=True,
         events=robot.events,
     )

@@ -110,7 +110,7 @@ def pretend(monkeypatch):
         def run_robot(plan, *_):
             plans.append(plan)
             code, run, *sentences = next(left)
-            return RunSummary(code, "", 1, 0, 1.0, tuple(sentences), log=str(run.log.path))
+            return RunSummary(code, "", 1, 0, tuple(sentences), log=str(run.log.path))
 
         monkeypatch.setattr(tracking_experiment, "run_robot", run_robot)
         monkeypatch.setattr(setups, "missing_priority", lambda scheduler: "")
