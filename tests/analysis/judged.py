@@ -22,7 +22,7 @@ from dataclasses import replace
 from typing import Any
 
 from msgspec import structs
-from tests.kit.cases import TextCase
+from tests.kit.cases import TextCase, place_of, read_form
 
 from dxlrun import LINEAR, ROTARY
 from dxlrun.channels.event_records import RUN_ENDED, EventCode, EventGroup, GoalReport, GoalTotals, Severity
@@ -188,10 +188,8 @@ def check_case(case: TextCase) -> None:
     assert expected, f"{case.place}: nothing is expected"
     for line in case.lines:
         for text in [] if line.text.startswith("=> ") else line.text.split("; "):
-            found = [(re.fullmatch(pattern, text), given) for pattern, given in GIVEN.items()]
-            (one, given), *_ = [pair for pair in found if pair[0]] or [(None, None)]
-            assert given, f"{line.place}: {text!r} is no line of a run"
-            run = given(run, *one.groups())
+            with place_of(line):
+                run = read_form(GIVEN, text)(run)
     verdict = judge_run(run)
     shown = "\n".join(
         f"{one.code} {one.subject} {one.rank!r}: {one.sentence} -> {one.remedy}" for one in verdict.findings

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
-from tests.kit.stories import send, tell
+from tests.kit.virtual_run import VirtualRun, send
 
 from dxlrun.channels.cycle import Torque
 from dxlrun.plan.loop_plan import JointPlan
-from dxlrun.testing import read_log, simulated_robot
+from dxlrun.testing import simulated_robot
 from dxlrun_analysis.finding import Finding, Rank
 from dxlrun_analysis.joints.following import followed
 from dxlrun_analysis.joints.joint_columns import JointColumns
@@ -230,9 +230,8 @@ controllers: {c: {type: joint_group_velocity_controller, joints: [w]}}
 
 def test_wheel_whose_position_wraps_is_not_accused_of_a_slipping_gear(tmp_path):
     """An AX-12A counts 300 degrees of a turn (e-Manual AX-12A, Present Position (36))."""
-    (tmp_path / "robot.yaml").write_text(WHEEL)
     asked = {20: [send("c", "velocities", 3.0)]}
-    log = read_log(tell(tmp_path / "robot.yaml", asked, tmp_path / "run.mcap", seconds=5.0))
+    log = VirtualRun.of_text(tmp_path, WHEEL, 5.0, asked=asked).finish()
     assert np.abs(np.diff(log.cycles["position"][:, 0])).max() > 5.0, "it wrapped"
     assert "position_jumped" not in {one.code for one in analyze(log).verdict.findings}
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from msgspec import structs
 from rich.console import Console
-from tests.kit.stories import Asked, ask, rate, send, switch, tell
+from tests.kit.virtual_run import Asked, VirtualRun, ask, rate, send, switch
 
 from dxlrun.channels.commands import CommandMessage
 from dxlrun.log.log_reader import Log, read_log
@@ -46,8 +46,7 @@ ASKED: Asked = {
 
 
 def run(directory: Path, asked: Asked) -> Log:
-    (directory / "pair.yaml").write_text(ROBOT)
-    return read_log(tell(directory / "pair.yaml", asked, directory / "run.mcap", seconds=2.0))
+    return read_log(VirtualRun.of_text(directory, ROBOT, 2.0, asked=asked).logged())
 
 
 @pytest.fixture(scope="module")

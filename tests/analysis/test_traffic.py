@@ -6,14 +6,13 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from tests.kit.virtual_run import VirtualRun
 
 from dxlrun.channels.logged_packets import LoggedPacket
 from dxlrun.log.columns import PacketColumns
-from dxlrun.testing import read_log, simulated_robot
+from dxlrun.testing import read_log
 from dxlrun_analysis.servos import exchanges as pairing
 from dxlrun_analysis.servos.traffic import Traffic
-from dxlsim.faults.fault import parse_fault
-from dxlsim.faults.script import FaultScript
 from dxlwire.packets import PacketKind
 
 pytestmark = pytest.mark.long
@@ -86,11 +85,10 @@ def test_slices_of_any_size_have_the_same_traffic(window_ms, monkeypatch):
 
 @pytest.mark.parametrize("name", ["humanoid_20", "mechanics", "wolfgang"])
 def test_traffic_is_that_of_the_ledger(name, tmp_path):
-    robot = simulated_robot(ROBOTS / f"{name}.yaml", duration_s=1.0, log=tmp_path / "run.mcap")
-    FaultScript([parse_fault("storm seed=5 faults=12 within=400ms at=1000ms")]).attach(robot.buses)
-    robot.run()
+    robot = VirtualRun(ROBOTS / f"{name}.yaml", tmp_path / "run.mcap", duration_s=1.0)
+    robot.fault("storm seed=5 faults=12 within=400ms at=1000ms")
     traffic = Traffic()
-    traffic.add_slice(read_log(tmp_path / "run.mcap"))
+    traffic.add_slice(read_log(robot.logged()))
     servos, buses = traffic.summarize_traffic()
     assert buses
     for bus in buses:

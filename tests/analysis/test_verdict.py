@@ -11,8 +11,8 @@ from msgspec import structs
 from tests.analysis.judged import MS, totals
 from tests.kit.made_logs import Cycle, Said, Wire, loop_of
 from tests.kit.totals import totals_of
+from tests.kit.virtual_run import VirtualRun, ask, rate
 
-from dxlrun.channels.commands import CommandMessage
 from dxlrun.channels.event_records import EventCode, Severity
 from dxlrun.log import log_reader, log_writer
 from dxlrun.log.log_reader import open_log, read_log
@@ -31,8 +31,6 @@ from dxlrun_analysis.servos.losses import ServoLosses
 from dxlrun_analysis.servos.traffic import ServoTraffic
 from dxlrun_analysis.tally import RealTime, Tally
 from dxlrun_analysis.verdict import judge_run
-from dxlsim.faults.fault import parse_fault
-from dxlsim.faults.script import FaultScript
 from dxlwire.packets import PacketKind
 
 ROBOTS = Path(__file__).parents[2] / "robots"
@@ -185,21 +183,15 @@ def test_simulated_bus_is_known_when_the_link_to_its_port_is_gone(write, tmp_pat
 def storm(tmp_path_factory):
     """The log of a stormy run, in small chunks, with streams, pauses and refusals."""
     path = tmp_path_factory.mktemp("storm") / "run.mcap"
-    robot = simulated_robot(ROBOTS / "bioloid_torso.yaml", duration_s=4.0, log=path)
-    storm = "storm seed=3 faults=12 within=3s kinds=lose,silence,noise,reboot at=300ms"
-    FaultScript([parse_fault(storm)]).attach(robot.buses)
-    asked = (
-        *((at, "rate", b'{"rate": 40}') for at in (600, 1900)),
-        *((at, "pause", b"") for at in (700, 750, 2000)),
-        *((at, "resume", b"") for at in (900, 2500)),
-    )
-    for number, (at_ms, kind, data) in enumerate(asked, start=1):
-        command = CommandMessage(number, "", kind, data, "anna")
-        robot.buses[0].at(at_ms * MS, lambda command=command: robot.inbox.waiting.append(command))
+    run = VirtualRun(ROBOTS / "bioloid_torso.yaml", path, duration_s=4.0)
+    run.fault("storm seed=3 faults=12 within=3s kinds=lose,silence,noise,reboot at=300ms")
+    pause, resume = ask("pause"), ask("resume")
+    asked = {600: rate(40), 1900: rate(40), 700: pause, 750: pause, 2000: pause, 900: resume, 2500: resume}
+    for ms, command in asked.items():
+        run.post_at(ms, command)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(log_writer, "CHUNK_BYTES", 4096)
-        robot.run()
-    return path
+        return run.logged()
 
 
 def test_log_counted_in_slices_is_the_log_counted_as_a_whole(storm, monkeypatch):

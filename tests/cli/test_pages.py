@@ -18,18 +18,16 @@ from tests.kit.awaited import DEADLINE_S
 from tests.kit.commands import Dxlrun
 from tests.kit.pages import page_blocks, page_commands, page_text
 from tests.kit.rigs import VirtualLines
+from tests.kit.virtual_run import VirtualRun
 
 import dxlrun as face
 from dxlrun import RemoteRobot
-from dxlrun.channels.answers import Completion
 from dxlrun.channels.commands import CommandMessage
 from dxlrun.cli.sim import sim
 from dxlrun.cli.steering.written import WrittenEntry
 from dxlrun.compile.robot_compiler import compile_files
-from dxlrun.control.controllers.plugin_loading import load_plugins
 from dxlrun.description.joints.joint_forms import Joint
 from dxlrun.description.reading import read_robot
-from dxlrun.remote.preparation import Preparation
 from dxlrun.run.run_summary import RunOptions, RunSummary
 from dxlrun.run.simulation_front import SimulationResult
 from dxlrun.testing import plan_of, read_log, simulated_robot
@@ -288,32 +286,28 @@ def test_motion_of_architecture_md_has_these_bytes_and_this_row(dxlrun: Dxlrun, 
     ((_, controller, kind, *words),) = page_commands("architecture.md")
     command, request, reply, _ = map(bytes.fromhex, re.findall(r"^(FF FF [\dA-F ]+)$", page, re.MULTILINE))
     torso = ROOT / "robots/bioloid_torso.yaml"
-    loop = plan_of(torso).loop
-    preparation = Preparation({joint.name: joint for joint in loop.joints}, load_plugins())
-    (head,) = (one for one in loop.controllers if one.name == controller)
+    robot = VirtualRun(torso, tmp_path / "torso.mcap", duration_s=4.0)
+    (head,) = (one for one in robot.plan.loop.controllers if one.name == controller)
     body = json.dumps(WrittenEntry.from_words(words, None).data).encode()
-    prepared = preparation.command(head, kind, body, units=True)
+    prepared = robot.door.command(head, kind, body, units=True)
     assert (len(prepared.data), prepared.beyond) == (32, ())
-    log = tmp_path / "torso.mcap"
-    robot = simulated_robot(torso, duration_s=4.0, log=log)
-    sent = CommandMessage(1, controller, kind, prepared.data, "a reader")
-    robot.buses[0].at(2_000_000_000, lambda: robot.inbox.waiting.append(sent))
-    robot.run()
-    assert isinstance(robot.inbox.answers[1], Completion)
+    sent = CommandMessage(0, controller, kind, prepared.data, "a reader")
+    robot.post_at(2000, sent)
+    recorded = robot.finish()
+    robot.require_done()
     entries = robot.ledger.entries
     moves = [one for one in entries if one.direction == "in" and one.t_ns > 2e9 and one.data[4] == 0x83]
     assert moves[3].data == command  # in the fourth cycle; what changed in it once more
     assert moves[4].data[7:12] == command[12:17]
     (at,) = (index for index, one in enumerate(entries) if one.data == reply)
     assert entries[at - 1].data == request
-    recorded = read_log(log)
     assert [packet.data for packet in recorded.packets].count(reply) == 1
     cycle = recorded.cycles[np.searchsorted(recorded.cycles["read_ns"], entries[at].t_ns)]
     row = recorded.joints.index("head_yaw_joint")
     assert f"{np.degrees(cycle['position'][row]):.1f} deg of the joint" in page
     assert f"{cycle['velocity'][row]:.2f} rad/s" in page
     assert (cycle["effort"][row], cycle["valid"][row]) == (-195 / 1023, True)
-    printed = [line.split() for line in dxlrun("analyze", log).out.splitlines()]
+    printed = [line.split() for line in dxlrun("analyze", recorded.path).out.splitlines()]
     shown = [line.split() for line in page.splitlines() if line.startswith(("joint  ", "head_yaw_joint  "))]
     assert len(shown) == 2
     assert all(row in printed for row in shown)

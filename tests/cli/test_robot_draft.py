@@ -1,21 +1,18 @@
 """A drafted robot file is one that compiles, for every model there is."""
 
 import math
-from array import array
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import pytest
 from tests.kit import wire
+from tests.kit.virtual_run import VirtualRun, send
 
-from dxlrun.channels.answers import Completion
-from dxlrun.channels.commands import CommandMessage
 from dxlrun.cli.tools.scan import draft, draft_file
 from dxlrun.compile.robot_compiler import compile_files
 from dxlrun.dynamixel.tools.scanning import FoundServo
 from dxlrun.errors import InputError, ServoFault
-from dxlrun.testing import simulated_robot
 from dxlwire.control_table import all_tables
 
 PORT = "/dev/ttyUSB0"
@@ -98,12 +95,11 @@ def test_first_send_to_a_drafted_robot_moves_it_slowly(
     text = draft_file(path, PORT, [found(each, model, protocol, baud_rate) for each in (1, 2)], 0)
     assert text.count(f"velocity: {slow} deg/s") == 2
     assert "limits.velocity after" in text
-    robot = simulated_robot(path, arguments={"port": "sim"}, duration_s=5.0)
-    goals = array("d", (1.0, -1.0)).tobytes()
-    robot.inbox.waiting.append(CommandMessage(1, "all_joints", "positions", goals, "anna"))
+    asked = {0: [send("all_joints", "positions", 1.0, -1.0)]}
+    robot = VirtualRun(path, asked=asked, arguments={"port": "sim"}, duration_s=5.0)
     result = robot.run()
     assert (result.reason, result.detail) == ("ended", "")
-    assert isinstance(robot.inbox.answers[1], Completion)
+    robot.require_done()
     bus = robot.plan.buses[0]
     sent = [*wire.instructions(robot.ledger.entries, bus)]
     written = [

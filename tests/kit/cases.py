@@ -1,4 +1,4 @@
-"""Cases as text: the form that the texts of the tests share, and its parser.
+"""Cases as text: the form that the texts of the tests share, its parser, and how runners read a line.
 
     name: pair                         the head, in the language of the runner: often a robot file
     joints: {elbow: {bus: main, id: 3}}
@@ -14,7 +14,9 @@ second change of a robot file does. The runner of a text describes its words. It
 place of that line, FILE:LINE.
 """
 
-from collections.abc import Iterator
+import re
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -79,3 +81,35 @@ def _cases_of(file: Path) -> list[TextCase]:
 def case_parameters(*paths: Path) -> list[Any]:
     """Return cases as parameters of a test, with ids such as `goals.txt:12: A goal is reached`."""
     return [pytest.param(case, id=f"{case.place}: {case.name}") for case in read_cases(*paths)]
+
+
+def find_form(forms: Mapping[str, Callable[..., Any]], text: str) -> Callable[..., Any] | None:
+    """Return the function of the form that a text has, which gets the groups of its pattern last."""
+    for pattern, act in forms.items():
+        if found := re.fullmatch(pattern, text):
+            groups = found.groups()
+            return lambda *first: act(*first, *groups)
+    return None
+
+
+def read_form(forms: Mapping[str, Callable[..., Any]], text: str) -> Callable[..., Any]:
+    """Return what `find_form` finds. Raises AssertionError where a text has none of the forms."""
+    found = find_form(forms, text)
+    assert found, f"{text!r} has none of the forms {[*forms]}"
+    return found
+
+
+def fits(found: str, text: str, *, whole: bool = True) -> bool:
+    """Compare a text with one in which `...` stands for anything, or search for that one."""
+    pattern = ".*".join(map(re.escape, text.split("...")))
+    return (re.fullmatch if whole else re.search)(pattern, found, re.DOTALL) is not None
+
+
+@contextmanager
+def place_of(line: Line) -> Iterator[None]:
+    """Add the place of a line to an error."""
+    try:
+        yield
+    except Exception as error:
+        error.add_note(f"{line.place}: {line.text}")
+        raise

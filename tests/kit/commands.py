@@ -30,6 +30,7 @@ from typing import Any, NamedTuple
 
 import pytest
 from tests.kit.answers import read_answer
+from tests.kit.cases import fits
 
 from dxlrun.cli import main, verb_registry
 from dxlrun.cli.app import build
@@ -230,5 +231,4 @@ def _squeezed(line: str) -> str:
 
 def matches(pattern: str, line: str) -> bool:
     """Compare a line with one of a text, in which `...` stands for any words."""
-    parts = _squeezed(pattern).split("...")
-    return re.fullmatch(".*".join(map(re.escape, parts)), line) is not None
+    return fits(line, _squeezed(pattern))

@@ -20,9 +20,10 @@ Expected is one of `CHECKS`; `...` stands for any text, and FILE for the path of
 import math
 import re
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
-from tests.kit.cases import TextCase
+from tests.kit.cases import TextCase, fits, read_form
 from tests.kit.hands import HandLine, Script, interrupt, written
 
 from dxlrun.compile.robot_compiler import compile_files
@@ -114,11 +115,7 @@ def servos_of(text: str) -> HandLine:
     return line
 
 
-def has(found: str, text: str) -> bool:
-    """Search a text in which `...` stands for anything."""
-    return re.search(".*".join(map(re.escape, text.split("..."))), found, re.DOTALL) is not None
-
-
+has = partial(fits, whole=False)
 CHECKS: dict[str, Callable[..., bool]] = {
     r"exit (\d)": lambda case, err, code: case.code == int(code),
     "fails (.*)": lambda case, err, text: has(case.error, text),
@@ -150,11 +147,6 @@ def check_dialogue(folder: Path, told: TextCase, err: Callable[[], str]) -> None
     written_err = err().replace(str(case.path), "FILE")
     assert case.said, told.place
     for line in case.said:
-        found = next(
-            (match, check) for words, check in CHECKS.items() if (match := re.fullmatch(words, line))
-        )
-        text = [None if one is None else one.replace("FILE", str(case.path)) for one in found[0].groups()]
-        if line.startswith("writes"):
-            text = [*found[0].groups()]
+        check = read_form(CHECKS, line if line.startswith("writes") else line.replace("FILE", str(case.path)))
         seen = (told.place, line, case.code, case.error, case.script.text, written_err)
-        assert found[1](case, written_err, *text), seen
+        assert check(case, written_err), seen

@@ -22,7 +22,6 @@ written. The ledger of the simulated bus and the simulated servos are the judges
 """
 
 import math
-import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -31,7 +30,7 @@ from typing import Any
 
 import pytest
 from msgspec.structs import replace
-from tests.kit.cases import TextCase
+from tests.kit.cases import TextCase, find_form, fits, read_form
 from tests.kit.line_faults import corrupt_next, delay_next, truncate_next, turn_by_hand
 from tests.kit.plans import make_plan
 from tests.kit.rigs import Rig, every_servo, make_rig, make_x
@@ -107,11 +106,21 @@ class Case:
     def follow(self, line: str) -> None:
         """Do a step, or check an expectation."""
         if not line.startswith("=>"):
-            do_one(STEPS, line, self)
+            self.do_step(line)
             return
         self.begin()
-        if not do_one(EXPECTATIONS, line[2:].strip(), self, optional=True):
+        if check := find_form(EXPECTATIONS, line[2:].strip()):
+            check(self)
+        else:
             self.expect_report(line[2:].strip())
+
+    def do_step(self, text: str) -> None:
+        if act := find_form(SETUP, text):
+            act(self)
+            return
+        act = read_form(AFTER_START, text)
+        self.begin()
+        act(self)
 
     def begin(self) -> None:
         """Start the robot, once."""
@@ -149,10 +158,9 @@ class Case:
 
     def expect_report(self, line: str) -> None:
         """Take the next report, which must be this one; routine ones may come before it."""
-        pattern = ".*".join(re.escape(one) for one in line.split("..."))
         reports = self.reports()
         while reports:
-            if re.fullmatch(pattern, reports[0], re.DOTALL):
+            if fits(reports[0], line):
                 reports.pop(0)
                 return
             assert reports[0].startswith(ROUTINE), "this was not reported, but:"
@@ -216,7 +224,7 @@ class Case:
 
     def change_servo(self, servo_id: str, changes: str) -> None:
         for change in changes.split(", "):
-            do_one(CHANGES, change, self, self.rig.servo(int(servo_id)))
+            read_form(CHANGES, change)(self, self.rig.servo(int(servo_id)))
 
     def act_before(
         self, packet: Sequence[str], value: str | None, first: str | None, last: str, step: str
@@ -229,7 +237,7 @@ class Case:
             nonlocal count
             count += 1
             if least <= count <= most:
-                do_one(STEPS, step, self)
+                self.do_step(step)
 
         data = b"" if value is None else bytes((int(value),))
         self.rig.when(partial(is_packet, self.plan.protocol, packet, data), act)
@@ -340,20 +348,6 @@ def poke(_case: Case, servo: SimulatedServo, name: str, value: str) -> None:
     servo.poke(name, int(value))
 
 
-def do_one(
-    table: dict[str, Callable[..., object]], text: str, case: Case, *more: object, optional: bool = False
-) -> bool:
-    """Call the function of the first pattern that a text fits; return whether there is one."""
-    for pattern, act in table.items():
-        if found := re.fullmatch(pattern, text):
-            if pattern in AFTER_START and table is STEPS:
-                case.begin()
-            act(case, *more, *found.groups())
-            return True
-    assert optional, "no such step"
-    return False
-
-
 SETUP: dict[str, Callable[..., object]] = {
     r"servos: (\S+) ([\d ]+)(?:, (.+))?": Case.plan_servos,
     r"declared (\d+): (.+)": Case.declare,
@@ -390,7 +384,6 @@ AFTER_START: dict[str, Callable[..., object]] = {
     r"bus plugged in": lambda case: case.rig.buses[0].plug_in(),
     r"stop": Case.stop,
 }
-STEPS = SETUP | AFTER_START
 CHANGES: dict[str, Callable[..., object]] = {
     r"silent": lambda _, servo: servo.silence(),
     r"answers": lambda _, servo: servo.silence(False),

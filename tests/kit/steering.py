@@ -18,7 +18,7 @@ Requests of a step are separated by `;`, and are done where nothing else is said
 
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache, partial
@@ -29,12 +29,13 @@ import msgspec
 import numpy as np
 import pytest
 import yaml
-from tests.kit.cases import Line, TextCase
+from tests.kit.cases import Line, TextCase, place_of, read_form
 from tests.kit.line_faults import turn_by_hand
+from tests.kit.virtual_run import VirtualRun
 
 import dxlrun
 from dxlrun.channels.answers import Acceptance, Completion, Refusal
-from dxlrun.channels.commands import LOOP, CommandMessage, QueueInbox
+from dxlrun.channels.commands import LOOP, CommandMessage
 from dxlrun.channels.cycle import LIMP, OFFLINE
 from dxlrun.channels.event_records import Event, EventCode
 from dxlrun.channels.ring import RecordKind
@@ -42,8 +43,7 @@ from dxlrun.compile import robot_compiler
 from dxlrun.control.controllers.plugin_loading import Offer, PlugIns, load_plugins
 from dxlrun.plan.robot_plan import Plan
 from dxlrun.remote.preparation import Preparation, RefusedRequest
-from dxlrun.run import virtual_run
-from dxlrun.testing import VirtualRobot, plan_of
+from dxlrun.testing import plan_of
 from dxlsim.servo.simulated_servo import SimulatedServo
 from dxlwire.modes import Mode
 
@@ -147,74 +147,55 @@ class Step:
     checks: list[Line] = field(default_factory=list)
 
 
-@dataclass
-class Story(QueueInbox):
-    """A case of a text: runs its robot, and checks each step."""
+class Story(VirtualRun):
+    """The run of a case, which checks each step."""
 
-    robot_text: str
-    steps: list[Step]
-
-    def check(self, folder: Path) -> None:
-        """Run the story; raise AssertionError with file, line and what was found."""
-        QueueInbox.__init__(self)
-        self.coming, self.step = list(self.steps), Step(-1.0, [], "")
-        self.events: list[str] = []
+    def __init__(self, plan: Plan, steps: Sequence[Step]) -> None:
+        self.coming, self.step = list(steps), Step(-1.0, [], "")
+        self.emitted: list[str] = []
         self.calls: list[str] = []
         self.sets: list[list[str]] = []
         self.asked: list[int] = []
         self.later: list[int] = []  # requests that wait
         self.taken: dict[str, Any] = {}
         self.breaks: dict[tuple[str, str], Callable[[Any], None]] = {}
-        self.count, self.ending, self.result = 0, False, None
-        with pytest.MonkeyPatch.context() as patch:
-            plan = compile_story(self.robot_text, folder)
-            own = type("OwnScripted", (Scripted,), {"story": self})
-            self.plugins = with_scripted(own)
-            patch.setattr(virtual_run, "load_plugins", lambda **_: self.plugins)
-            self.robot = VirtualRobot(plan, inbox=self, watch=self.see)
-        self.plan = plan
-        self.rows = {joint.name: row for row, joint in enumerate(plan.loop.joints)}
-        self.servos: dict[str, tuple[SimulatedServo, Any]] = {
-            servo.joint: (bus.servo(servo.servo_id), servo)
-            for bus, planned in zip(self.robot.buses, plan.buses, strict=True)
-            for servo in planned.servos
-        }
         self.torque_given: list[str] = []
-        for name, (servo, _) in self.servos.items():
+        self.ending = False
+        plugins = with_scripted(type("OwnScripted", (Scripted,), {"story": self}))
+        super().__init__(plan, plugins=plugins, watch=self.see)
+        self.door = Preparation({joint.name: joint for joint in plan.loop.joints}, plugins)
+        for name, servo in self.servos.items():
             servo.registers.watch_items(("torque_enable",), partial(self.see_torque, name, servo))
-        self.result = self.robot.run()
+
+    def check(self) -> None:
+        """Run; raise AssertionError with file, line and what was found."""
+        self.run()
         self.end_step()
         assert not self.coming, f"{self.coming[0].place}: the run ended before: {self.result}"
 
     # While it runs
 
-    def drain_commands(self) -> Any:
-        """Begin the steps that are due; called in each cycle."""
-        now_s = self.robot.record.cycle * self.plan.loop.period_ns * 1e-9 + 1e-6
+    def begin_cycle(self) -> None:
+        """Begin the steps that are due."""
+        now_s = self.record.cycle * self.plan.loop.period_ns * 1e-9 + 1e-6
         if not self.coming and now_s >= self.step.at_s + LAST_S:
-            self.robot.stop.request()
+            self.stop.request()
             self.ending = True
         while self.coming and now_s >= self.coming[0].at_s:
             self.end_step()
             self.step = self.coming.pop(0)
-            for kept in (self.events, self.calls, self.asked, self.torque_given):
+            for kept in (self.emitted, self.calls, self.asked, self.torque_given):
                 kept.clear()
             self.sets = self.sets[-1:]
             for action in self.step.actions:
-                self.act(action)
-        return super().drain_commands()
-
-    def answer_command(self, number: int, answer: Any) -> None:
-        before = self.answers.get(number)
-        assert before is None or isinstance(before, Acceptance), f"{number} is answered twice: {answer}"
-        super().answer_command(number, answer)
+                read_form(ACTIONS, action)(self)
 
     def see(self, kind: RecordKind, payload: Any) -> None:
         """Keep an event, or what is active in a cycle."""
         if kind == RecordKind.TAGGED:
             with suppress(msgspec.ValidationError):
                 event = msgspec.msgpack.decode(payload, type=Event)
-                self.events.append(f"{EventCode(event.code).name.lower()} {event.source}: {event.text}")
+                self.emitted.append(f"{EventCode(event.code).name.lower()} {event.source}: {event.text}")
         elif kind == RecordKind.CYCLE:
             self.taken = self.snapshot()
             if self.sets[-1:] != [self.taken["active"]]:
@@ -225,12 +206,12 @@ class Story(QueueInbox):
             self.torque_given.append(name)
 
     def snapshot(self) -> dict[str, Any]:
-        record, states = self.robot.record, self.robot.record.states
-        plans = self.robot.robot.manager.plans
+        record, states = self.record, self.record.states
         arrays = {"commands": record.commands.values, "reference": record.reference, "torque": states.torque}
         arrays |= {"position": states.position, "mode": states.mode}
         found: dict[str, Any] = {name: array.copy() for name, array in arrays.items()}
-        found["on"] = {name: servo.torque_on for name, (servo, _) in self.servos.items()}
+        found["on"] = {name: servo.torque_on for name, servo in self.servos.items()}
+        plans = self.robot.manager.plans
         found["active"] = [plan.name for bit, plan in enumerate(plans) if record.active >> bit & 1]
         return found
 
@@ -244,36 +225,16 @@ class Story(QueueInbox):
 
     # Actions
 
-    def act(self, text: str) -> None:
-        for pattern, act in ACTIONS.items():
-            if found := re.fullmatch(pattern, text):
-                act(self, *found.groups())
-                return
-        raise AssertionError(f"{self.step.place}: no action: {text}")
-
-    def ask(self, kind: str, /, of: str = LOOP, lease_ns: int = 0, **data: Any) -> None:
-        """Put a request for the loop into the inbox, or the command of a controller."""
+    def request(self, kind: str, /, of: str = LOOP, lease_s: float = 0.0, **data: Any) -> None:
+        """Request something of the loop, or send a command to a controller."""
         try:
-            raw = json.dumps(data).encode() if data else b""
-            if of != LOOP:
-                raw = self.prepared(of, kind, raw or b"{}")
+            named = of in [plan.name for plan in self.robot.manager.plans]
+            raw = json.dumps(data).encode() if data and of == LOOP else b""
+            unchecked = CommandMessage(0, of, kind, raw, "anna", round(lease_s * 1e9))
+            self.asked.append(self.post(self.prepared(of, kind, data, lease_s) if named else unchecked))
         except RefusedRequest as error:
-            self.count += 1
-            self.asked.append(self.count)
-            self.answers[self.count] = error.refusal
-        else:
-            self.post(kind, raw, of, lease_ns)
-
-    def post(self, kind: str, raw: bytes, of: str = LOOP, lease_ns: int = 0) -> None:
-        self.count += 1
-        self.asked.append(self.count)
-        self.waiting.append(CommandMessage(self.count, of, kind, raw, "anna", lease_ns))
-
-    def prepared(self, controller: str, kind: str, body: bytes) -> bytes:
-        """Return a command as the gateway hands it over; nothing where there is no such controller."""
-        plans = {plan.name: plan for plan in self.robot.robot.manager.plans}
-        preparation = Preparation({joint.name: joint for joint in self.plan.loop.joints}, self.plugins)
-        return preparation.command(plans[controller], kind, body).data if controller in plans else b""
+            self.asked.append(self.inbox.numbered(unchecked).number)
+            self.inbox.answers[self.asked[-1]] = error.refusal
 
     def load(self, name: str, entry: str) -> None:
         keys = yaml.safe_load(entry)
@@ -284,32 +245,27 @@ class Story(QueueInbox):
             key: keys.pop(key) for key in ("into", "reference", "fallback", "rate", "reads") if key in keys
         }
         parameters = json.dumps({**own, "exports": fields.get("reference", []), **keys})
-        self.ask("load", name=name, type="scripted", parameters=parameters, **usual, **own, **fields)
+        self.request("load", name=name, type="scripted", parameters=parameters, **usual, **own, **fields)
 
     def turn(self, joint: str, position: str) -> None:
-        servo, planned = self.servos[joint]
-        turn_by_hand(servo, planned.direction * float(position) + planned.reference)
+        (planned,) = (one for bus in self.plan.buses for one in bus.servos if one.joint == joint)
+        turn_by_hand(self.servos[joint], planned.direction * float(position) + planned.reference)
 
     def stick(self, joint: str, item: str, value: str) -> None:
         """Let an item of a servo keep a value, whatever is written."""
-        servo = self.servos[joint][0]
+        servo = self.servos[joint]
         servo.registers.watch_items((item,), lambda: servo.poke(item, int(value)))
 
     # Checks
 
     def end_step(self) -> None:
         """Check the lines of the step that ends."""
-        answers = [self.answers.get(number) for number in self.asked]
+        answers = [self.inbox.answers.get(number) for number in self.asked]
         self.unnamed = list(zip(self.asked, answers, strict=True))
-        for place, line, _ in self.step.checks:
-            text = line.removeprefix("=> ")
-            for pattern, check in CHECKS.items():
-                if found := re.fullmatch(pattern, text):
-                    what = check(self, *found.groups())
-                    assert what is None, f"{place}: {text}\n  found: {what}\n  {self.told}"
-                    break
-            else:
-                raise AssertionError(f"{place}: no check: {text}")
+        for line in self.step.checks:
+            with place_of(line):
+                what = read_form(CHECKS, line.text.removeprefix("=> "))(self)
+                assert what is None, f"found: {what}\n  {self.told}"
         for _, answer in self.unnamed:
             done = isinstance(answer, Completion)
             assert done, f"{self.step.place}: not done: {answer}\n  {self.told}"
@@ -317,24 +273,26 @@ class Story(QueueInbox):
     @property
     def told(self) -> str:
         """Return what happened in the step."""
-        return "\n  ".join([*map(str, (self.sets, self.answers, self.result)), *self.calls, *self.events])
+        return "\n  ".join(
+            [*map(str, (self.sets, self.inbox.answers, self.result)), *self.calls, *self.emitted]
+        )
 
-    def answer(self, earlier: str | None) -> Any:
+    def next_answer(self, earlier: str | None) -> Any:
         """Return the answer to the next request of the step, or to the oldest one that waited."""
         number = self.later.pop(0) if earlier else self.unnamed.pop(0)[0]
-        return number, self.answers.get(number)
+        return number, self.inbox.answers.get(number)
 
     def refused(self, earlier: str | None, code: str, text: str | None) -> object:
-        _, found = self.answer(earlier)
+        _, found = self.next_answer(earlier)
         fits = isinstance(found, Refusal) and found.code == code and (text or "") in found.text
         return None if fits else found
 
     def done(self, earlier: str | None, text: str | None) -> object:
-        _, found = self.answer(earlier)
+        _, found = self.next_answer(earlier)
         return None if isinstance(found, Completion) and (text or "") in repr(found) else repr(found)
 
     def waits(self) -> object:
-        number, found = self.answer(None)
+        number, found = self.next_answer(None)
         self.later.append(number)
         return None if found is None or isinstance(found, Acceptance) else found
 
@@ -353,7 +311,7 @@ class Story(QueueInbox):
         fits = {"limp": is_limp and not on, "lost": is_lost, "holds": on and not is_limp and not is_lost}
         return None if fits[state] else f"torque {torque}, the servo has torque: {on}"
 
-    def command(self, joint: str, value: str) -> object:
+    def commanded(self, joint: str, value: str) -> object:
         found = self.taken["commands"][:, self.rows[joint]]
         found = found[np.isfinite(found)].tolist()
         wanted = [] if value == "nothing" else [float(value)]
@@ -363,7 +321,7 @@ class Story(QueueInbox):
         return None if found == pytest.approx(float(value), abs=tolerance, nan_ok=True) else found
 
     def reference(self, name: str, value: str) -> object:
-        place = self.robot.record.layout.references.index(name)
+        place = self.record.layout.references.index(name)
         return self.is_near(float(self.taken["reference"][place]), value.replace("nothing", "nan"))
 
     def mode(self, joint: str, name: str) -> object:
@@ -371,7 +329,7 @@ class Story(QueueInbox):
         return None if found == name.replace(" ", "_") else found
 
     def event(self, no: str | None, text: str) -> object:
-        found = [event for event in self.events if text in event]
+        found = [event for event in self.emitted if text in event]
         return None if bool(found) == (not no) else found
 
     def ended(self, reason: str, text: str | None) -> object:
@@ -408,22 +366,22 @@ def requesting(act: str) -> Callable[..., None]:
 
 
 def switch(story: Story, activate: str | None, deactivate: str | None) -> None:
-    story.ask("switch", activate=(activate or "").split(), deactivate=(deactivate or "").split())
+    story.request("switch", activate=(activate or "").split(), deactivate=(deactivate or "").split())
 
 
 def flicker(story: Story, joint: str) -> None:
     """Let a servo answer in every second 20 ms from now on, without an end."""
-    bus = next(bus for bus in story.robot.buses if story.servos[joint][0] in bus.servos)
+    bus = next(bus for bus in story.buses if story.servos[joint] in bus.servos)
 
     def turn(on: bool) -> None:
-        story.servos[joint][0].silence(on)
+        story.servos[joint].silence(on)
         bus.at(bus.now_ns + 20_000_000, partial(turn, not on))
 
     turn(True)
 
 
 def servo_action(name: str, *values: Any) -> Callable[[Story, str], None]:
-    return lambda story, joint: getattr(story.servos[joint][0], name)(*values)
+    return lambda story, joint: getattr(story.servos[joint], name)(*values)
 
 
 def play(story: Story, text: str) -> None:
@@ -445,29 +403,30 @@ def play(story: Story, text: str) -> None:
             }
         )
     head = json.dumps({"parts": parts}).encode()
-    story.post("play", head + b"\n" + np.array(values, dtype="<f8").tobytes())
+    data = head + b"\n" + np.array(values, dtype="<f8").tobytes()
+    story.asked.append(story.post(CommandMessage(0, LOOP, "play", data, "anna")))
 
 
 def command(story: Story, controller: str, kind: str, data: str, seconds: str | None) -> None:
-    story.ask(kind, controller, round(float(seconds or 0) * 1e9), **yaml.safe_load(data or "{}"))
+    story.request(kind, controller, float(seconds or 0), **yaml.safe_load(data or "{}"))
 
 
 ACTIONS: dict[str, Callable[..., None]] = {
     r"(?:activate (.+?))?(?:, )?(?:deactivate (.+))?": switch,
-    r"torque (on|off) (.+?)( release)?": lambda story, on, joints, release: story.ask(
+    r"torque (on|off) (.+?)( release)?": lambda story, on, joints, release: story.request(
         "torque", joints=joints.split(), on=on == "on", release=bool(release)
     ),
-    r"reboot (.+?)( release)?": lambda story, joints, release: story.ask(
+    r"reboot (.+?)( release)?": lambda story, joints, release: story.request(
         "reboot", joints=joints.split(), release=bool(release)
     ),
-    r"rate (\S+) Hz": lambda story, rate: story.ask("rate", rate=float(rate)),
-    r"(pause|resume|halt|stop)": lambda story, kind: story.ask(kind),
-    r"cancel goal (-?\d+)": lambda story, goal: story.ask("cancel", goal=int(goal)),
-    r"cancel (\w+)": lambda story, name: story.ask("cancel", controller=name),
+    r"rate (\S+) Hz": lambda story, rate: story.request("rate", rate=float(rate)),
+    r"(pause|resume|halt|stop)": lambda story, kind: story.request(kind),
+    r"cancel goal (-?\d+)": lambda story, goal: story.request("cancel", goal=int(goal)),
+    r"cancel (\w+)": lambda story, name: story.request("cancel", controller=name),
     r"load (\w+) (\{.*\})": Story.load,
-    r"unload (\w+)": lambda story, name: story.ask("unload", controller=name),
-    r"ask (\w+) (\{.*\})": lambda story, kind, data: story.ask(kind, **yaml.safe_load(data)),
-    r"parameters (\w+) (\{.*\})": lambda story, name, values: story.ask(
+    r"unload (\w+)": lambda story, name: story.request("unload", controller=name),
+    r"ask (\w+) (\{.*\})": lambda story, kind, data: story.request(kind, **yaml.safe_load(data)),
+    r"parameters (\w+) (\{.*\})": lambda story, name, values: story.request(
         "parameters", controller=name, values=yaml.safe_load(values)
     ),
     r"send (\w+) (\w+)(?: (\{.*\}))?(?: for (\S+) s)?": command,
@@ -483,9 +442,7 @@ ACTIONS: dict[str, Callable[..., None]] = {
     r"answer (\w+)": servo_action("silence", False),
     r"overload (\w+)": servo_action("trigger_overload"),
     r"power cycle (\w+)": servo_action("power_cycle"),
-    r"poke (\w+) (\w+) (\d+)": lambda story, joint, item, value: story.servos[joint][0].poke(
-        item, int(value)
-    ),
+    r"poke (\w+) (\w+) (\d+)": lambda story, joint, item, value: story.servos[joint].poke(item, int(value)),
 }
 """Actions of a step."""
 
@@ -497,7 +454,7 @@ CHECKS: dict[str, Callable[..., object]] = {
     r"(activate|deactivate|command|goal|cancel|parameters) called: (.+)": Story.ordered,
     r"(\w+) (limp|holds|lost)": Story.torque,
     r"(\w+) got no torque": lambda story, name: name in story.torque_given or None,
-    r"(\w+) commanded (\S+)": Story.command,
+    r"(\w+) commanded (\S+)": Story.commanded,
     r"(\w+) at (\S+)": lambda story, name, value: story.is_near(
         float(story.taken["position"][story.rows[name]]), value, 0.02
     ),
@@ -533,21 +490,19 @@ def compile_story(text: str, folder: Path) -> Plan:
     return PLANS[text]
 
 
-def read_story(case: TextCase) -> Story:
-    story = Story(case.head, [])
+def check_story(case: TextCase, folder: Path) -> None:
+    """Run a case; raise AssertionError with file, line and what was found."""
+    text, steps = case.head, list[Step]()
     for line in case.lines:
         if found := re.fullmatch(r"at (\S+) s *(.*)", line.text):
             actions = found[2].split("; ") if found[2] else []
-            story.steps.append(Step(float(found[1]), actions, line.place))
+            steps.append(Step(float(found[1]), actions, line.place))
         elif line.text.startswith("=> "):
-            assert story.steps, f"{line.place}: nothing is expected before the first step"
-            story.steps[-1].checks.append(line)
+            assert steps, f"{line.place}: nothing is expected before the first step"
+            steps[-1].checks.append(line)
         else:
             right, _, wrong = line.text.replace("\\n", "\n").partition(" => ")
-            assert right in story.robot_text or right.startswith("+ "), f"{line.place}: {right}"
-            story.robot_text = (
-                f"{story.robot_text}{right[2:]}\n"
-                if right.startswith("+ ")
-                else story.robot_text.replace(right, wrong, 1)
-            )
-    return story
+            added = right.startswith("+ ")
+            assert added or right in text, f"{line.place}: {right}"
+            text = f"{text}{right[2:]}\n" if added else text.replace(right, wrong, 1)
+    Story(compile_story(text, folder), steps).check()

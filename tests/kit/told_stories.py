@@ -34,7 +34,7 @@ and by more lines of the same names.
 import json
 import math
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from itertools import groupby
 from pathlib import Path
@@ -43,45 +43,79 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from tests.kit.cases import Line, TextCase, read_cases
-from tests.kit.clients import Ask, clients_of
+from tests.kit.cases import Line, TextCase, fits, place_of, read_cases, read_form
 from tests.kit.line_faults import lose_replies, turn_by_hand
-from tests.kit.wire import SYNC_WRITE, taken_apart, values_written, writes
+from tests.kit.virtual_run import MS, VirtualRun, ask, source_states
+from tests.kit.wire import SYNC_WRITE, taken_apart, writes
 
-from dxlrun.channels.answers import Code, Completion
 from dxlrun.channels.event_records import EventCode
 from dxlrun.compile.motion_names import is_name
 from dxlrun.log.log_reader import Log, open_log, read_log
-from dxlrun.testing import VirtualRobot, simulated_robot
 from dxlrun_analysis.replay import replay_log
-from dxlsim.bus.simulated_bus import SimulatedBus
-from dxlsim.faults.fault import parse_fault
 from dxlsim.faults.kinds import KINDS
-from dxlsim.faults.script import FaultScript
-from dxlsim.servo.simulated_servo import SimulatedServo
-from dxlwire.control_table import find_table
 
 ROBOTS = Path(__file__).parents[2] / "robots"
-LOOK_NS = 10_000_000
+LOOK_MS = 10
 WHERE = r"(?: at (?P<at>[\d.]+)| from (?P<begin>[\d.]+) to (?P<end>[\d.]+))?"
 HOW = r"(?:(?P<measure>most|spread|step|bend|in (?P<ms>\d+) ms) )?"
 NUMBERS = r"(?P<low>[-\d.]+|nan)(?: to (?P<high>[-\d.]+))?(?: deg)?"
 MEASURED = re.compile(rf"(?P<column>\w+) (?P<name>[\w./]+){WHERE}: {HOW}{NUMBERS}$")
 
 
+def request(run: VirtualRun, *words: str) -> None:
+    at_s, controller, kind, values, lease_s = words
+    fields, ms = yaml.safe_load(values), float(at_s) * 1000
+    if controller:
+        run.command(ms, controller, kind, fields, float(lease_s or 0))
+    else:
+        run.ask(ms, ask(kind, fields))
+
+
+def turn(run: VirtualRun, servo_id: str, degrees: str, ms: str) -> None:
+    servo = run.servo(int(servo_id))
+    run.at(int(ms), lambda: turn_by_hand(servo, servo.shaft.angle + math.radians(float(degrees))))
+
+
+def mute(run: VirtualRun, servo_id: str, ms: str, for_ms: str) -> None:
+    lose_replies(run.buses[0], int(servo_id), int(ms) * MS, (int(ms) + int(for_ms)) * MS)
+
+
+def delay(run: VirtualRun, ms: str, for_ms: str) -> None:
+    hardware, left = run.robot.hardware, [int(for_ms) * MS]
+    read = hardware.read_states
+
+    def read_late() -> None:
+        if left and run.now_ms >= int(ms):
+            run.clock.wait_until(run.clock.now_ns() + left.pop())
+        read()
+
+    vars(hardware)["read_states"] = read_late
+
+
+def poke(run: VirtualRun, servo_id: str, item: str, value: str, ms: str | None) -> None:
+    write = partial(run.servo(int(servo_id)).poke, item, int(value))
+    run.at(int(ms), write) if ms else write()
+
+
+EVENTS: dict[str, Callable[..., None]] = {
+    r"hand servo=(\d+) by=([-\d.]+) at=(\d+)ms": turn,
+    r"mute servo=(\d+) at=(\d+)ms for=(\d+)ms": mute,
+    r"busy at=(\d+)ms for=(\d+)ms": delay,
+    r"poke servo=(\d+) (\w+) (-?\d+)(?: at=(\d+)ms)?": poke,
+    r"at ([\d.]+) (?:(\w+) )?(\w+) (\{.*\})(?: for ([\d.]+) s)?": request,
+}
+"""What happens in a run."""
+
+
 class Story:
-    """One case: what is asked before the run, and what is expected after it."""
+    """One case: what happens in the run, and what is expected after it."""
 
     def __init__(self, folder: Path, text: Path, robot: str, motion: str, shafts: Iterable[int]) -> None:
         self.folder, self.beside, self.robot, self.motion = folder, text.parent, robot, motion
-        self.seconds, self.arguments = 0.0, dict[str, str]()
-        self.play, self.asks, self.faults = list[Path | str](), list[Ask](), list[Any]()
-        self.hands: list[tuple[int, float, int]] = []
-        self.mute: list[tuple[int, ...]] = []
-        self.busy: list[tuple[int, ...]] = []
-        self.pokes: list[tuple[int, str, int, int]] = []
+        self.seconds, self.arguments, self.shafts = 0.0, dict[str, str](), shafts
+        self.play, self.faults = list[Path | str](), list[str]()
+        self.events: list[Callable[[VirtualRun], None]] = []
         self.goals: list[dict[str, Any]] = []
-        self.shafts: dict[int, list[float]] = {number: [] for number in shafts}
 
     def tell(self, line: str) -> None:
         """Take a line of what happens."""
@@ -98,91 +132,29 @@ class Story:
             own = self.folder / "own_motion.yaml"
             own.write_text(self.motion)
             self.play.append(own if not rest else rest if is_name(rest) else ROBOTS / "motions" / rest)
-        elif word == "hand":
-            match = re.fullmatch(r"servo=(\d+) by=([-\d.]+) at=(\d+)ms", rest)
-            assert match, "write hand servo=ID by=DEGREES at=TIMEms"
-            servo, by, ms = match.groups()
-            self.hands.append((int(servo), math.radians(float(by)), int(ms) * 1_000_000))
-        elif word == "mute":
-            match = re.fullmatch(r"servo=(\d+) at=(\d+)ms for=(\d+)ms", rest)
-            assert match, "write mute servo=ID at=TIMEms for=TIMEms"
-            self.mute.append(tuple(map(int, match.groups())))
-        elif word == "busy":
-            match = re.fullmatch(r"at=(\d+)ms for=(\d+)ms", rest)
-            assert match, "write busy at=TIMEms for=TIMEms"
-            self.busy.append(tuple(1_000_000 * int(one) for one in match.groups()))
-        elif word == "poke":
-            servo, item, value, *at = rest.removeprefix("servo=").split()
-            at_ms = int(at[0].removeprefix("at=").removesuffix("ms")) if at else -1
-            self.pokes.append((int(servo), item, int(value), at_ms))
         elif word in KINDS:
-            self.faults.append(parse_fault(line))
+            self.faults.append(line)
         else:
-            self.ask(line)
-
-    def ask(self, line: str) -> None:
-        match = re.match(r"at ([\d.]+) (?:(\w+) )?(\w+) (\{.*\})(?: for ([\d.]+) s)?$", line)
-        assert match, "this line is no request, fault, change, `run` or `play`"
-        at, controller, kind, values, lease = match.groups()
-        self.asks.append(Ask(float(at), controller or "", kind, yaml.safe_load(values), float(lease or 0)))
+            self.events.append(read_form(EVENTS, line))
 
     def perform(self) -> None:
-        """Run, compare with the replay, and keep the log and where the shafts were."""
+        """Run, compare with the replay, and keep the log."""
         for beside in (*ROBOTS.iterdir(), *self.beside.iterdir()):
             (self.folder / beside.name).symlink_to(beside)
         file, path = self.folder / "own.yaml", self.folder / "run.mcap"
         file.write_text(self.robot)
-        options: dict[str, Any] = {"arguments": self.arguments, "play": self.play, "log": path}
-        robot = simulated_robot(file, duration_s=self.seconds or None, **options)
-        client = clients_of(robot, self.asks)
-        FaultScript(self.faults).attach(robot.buses)
-        for number, by, at_ns in self.hands:
-            servo = robot.buses[0].servo(number)
-            robot.buses[0].at(at_ns, partial(self._turn, servo, by))
-        for number, item, value, at_ms in self.pokes:
-            poke = partial(robot.buses[0].servo(number).poke, item, value)
-            poke() if at_ms < 0 else robot.buses[0].at(at_ms * 1_000_000, poke)
-        for number, at_ms, for_ms in self.mute:
-            lose_replies(robot.buses[0], number, at_ms * 1_000_000, (at_ms + for_ms) * 1_000_000)
-        self._delay(robot)
-        self._watch(robot)
-        self.result, self.virtual = robot.run(), robot
-        answers = [*client.answers.values()]
-        refused = [
-            one for one in answers if not isinstance(one, Completion) and one.code != Code.GOAL_REFUSED
-        ]
-        assert not refused, refused  # a refused goal has an outcome, which a line says
-        assert len(answers) == len(self.asks), f"{len(answers)} of {len(self.asks)} requests were answered"
+        options: dict[str, Any] = {"arguments": self.arguments, "play": self.play}
+        run = self.virtual = VirtualRun(file, path, duration_s=self.seconds or None, **options)
+        run.fault(*self.faults)
+        for happens in self.events:
+            happens(run)
+        run.sample(map(run.servo, self.shafts), LOOK_MS, end_ms=self.seconds * 1000)
+        self.result = run.run()
+        run.require_done()
         assert replay_log(path).same
         self.log: Log = read_log(path)
         ended = [event for event in self.log.events if event.code == EventCode.GOAL_ENDED]
         self.goals = [json.loads(event.data) for event in ended]
-
-    def _turn(self, servo: SimulatedServo, by: float) -> None:
-        turn_by_hand(servo, servo.shaft.angle + by)
-
-    def _delay(self, robot: VirtualRobot) -> None:
-        hardware, clock, busy = robot.robot.hardware, robot.clock, [*self.busy]
-        read = hardware.read_states
-
-        def read_late() -> None:
-            if busy and clock.now_ns() >= busy[0][0]:
-                clock.wait_until(clock.now_ns() + busy.pop(0)[1])
-            read()
-
-        vars(hardware)["read_states"] = read_late
-
-    def _watch(self, robot: VirtualRobot) -> None:
-        for bus in robot.buses:
-            for number in self.shafts:
-                look = partial(self._look, bus, number)
-                for t_ns in range(0, round(self.seconds * 1e9), LOOK_NS):
-                    bus.at(t_ns, look)
-
-    def _look(self, bus: SimulatedBus, number: int) -> None:
-        servo = bus.servo(number)
-        servo.advance_to(bus.now_ns)
-        self.shafts[number].append(servo.shaft_angle)
 
     def expect(self, line: str) -> None:
         word, _, rest = line.partition(" ")
@@ -191,7 +163,7 @@ class Story:
             goal = next(one for one in self.goals if one["controller"] == controller)
             self.goals.remove(goal)
             assert goal["status"] == status, goal
-            assert not text or matches(goal["text"], text[0]), goal
+            assert not text or fits(goal["text"], text[0]), goal
         elif word in ("event", "no", "times"):
             count, rest = rest.split(" ", 1) if word == "times" else ("", rest.removeprefix("event "))
             source, _, text = rest.partition(" ")
@@ -200,7 +172,7 @@ class Story:
                 for event in self.log.events
                 if source == "any" or event.source in (source, "runtime")
             ]
-            found = sum(matches(one, text) for one in texts)
+            found = sum(fits(one, text) for one in texts)
             assert found == int(count) if count else bool(found) == (word == "event"), texts
         elif word == "lasts":
             least, most = map(float, rest.removesuffix(" s").split(" to "))
@@ -208,13 +180,13 @@ class Story:
         elif word == "wrote":
             servo, _, rest = rest.partition(" ")
             item, _, values = rest.partition(":")
-            found = [value for _, value in self._written(int(servo), item)]
+            found = [value for _, value in self.virtual.sent(int(servo), item)]
             assert found == [int(value) for value in values.split()], found
         elif word == "goals":
             servo, _, addresses = rest.partition(": ")
             assert [*map(str, self._goal_addresses(int(servo)))] == addresses.split()
         elif word == "fails":
-            assert matches(f"{self.result.reason}, then {self.result.last}: {self.result.detail}", rest)
+            assert fits(f"{self.result.reason}, then {self.result.last}: {self.result.detail}", rest)
             self.result = None
         else:
             match = MEASURED.match(line)
@@ -238,16 +210,6 @@ class Story:
                     found += [address for servo, address, _ in written if servo == number]
         return [address for address, _ in groupby(found)]
 
-    def _written(self, number: int, name: str) -> Iterator[tuple[float, int]]:
-        """Yield the values of an item that a servo was sent, by the ledger, each with its time, s."""
-        for bus in self.virtual.plan.buses:
-            for servo in (one for one in bus.servos if one.servo_id == number):
-                item = find_table(servo.model, bus.protocol).items[name]
-                entries, place = self.virtual.ledger.entries, (item.address, item.size)
-                for t_ns, one, value in values_written(entries, bus, *place, signed=item.signed):
-                    if one == number:
-                        yield t_ns * 1e-9, value
-
     def values(self, column: str, name: str, match: re.Match[str]) -> Any:
         """Return what a line is about: values, or what it measures of them."""
         period_s = self.virtual.plan.loop.period_ns * 1e-9
@@ -255,16 +217,18 @@ class Story:
             return np.diff(open_log(self.folder / "run.mcap").columns(name)["t_ns"]) / 1e6
         if column == "sent":
             servo, _, item = name.partition("/")
-            written = np.array([*self._written(int(servo), item)])
-            begin, end = float(match["begin"] or written[-1, 0]), float(match["end"] or math.inf)
-            return measured(written[(begin <= written[:, 0]) & (written[:, 0] < end), 1], match, period_s)
+            ms, written = np.array(self.virtual.sent(int(servo), item)).T
+            begin = float(match["begin"]) * 1000 if match["begin"] else ms[-1]
+            end = float(match["end"]) * 1000 if match["end"] else math.inf
+            return measured(written[(begin <= ms) & (ms < end)], match, period_s)
         if column == "shaft":
-            rows = np.degrees(np.array(self.shafts[int(name)]) - self.middle(int(name)))
-            period_s = LOOK_NS * 1e-9
+            servo = self.virtual.servo(int(name))
+            rows = np.degrees(self.virtual.shaft(servo) - self.middle(int(name)))
+            period_s = LOOK_MS * 1e-3
+        elif column == "source_state":
+            rows = source_states(self.log)[name]
         else:
             names = self.log.joints if "/" not in name else self.virtual.record.layout.references
-            if column == "source_state":
-                names = [f"{one}/{state}" for one, each in self.log.header.sources.items() for state in each]
             rows = self.log.cycles[column][:, list(names).index(name)]
         if match["begin"]:
             part = slice(*(round(float(match[end]) / period_s) for end in ("begin", "end")))
@@ -295,12 +259,6 @@ def measured(values: Any, match: re.Match[str], period_s: float) -> Any:
         apart = round(float(match["ms"]) * 1e-3 / period_s) if match["ms"] else 1
         return np.array([np.abs(values[apart:] - values[:-apart]).max()])
     return values
-
-
-def matches(found: str, text: str) -> bool:
-    """Compare a text with one whose ends may be `...`."""
-    pattern = ".*".join(re.escape(part) for part in text.split("..."))
-    return re.fullmatch(pattern, found, re.DOTALL) is not None
 
 
 def story_parameters(folder: Path) -> Iterator[Any]:
@@ -339,17 +297,14 @@ def check_story(case: TextCase, folder: Path) -> None:
     shafts = {int(text.split()[2].rstrip(":")) for text in texts if text.startswith("=> shaft ")}
     story = Story(folder, case.file, robot, motion, shafts)
     performed = False
-    for place, text, _ in case.lines:
-        try:
-            if not text.startswith("=> "):
-                story.tell(text)
+    for line in case.lines:
+        with place_of(line):
+            if not line.text.startswith("=> "):
+                story.tell(line.text)
                 continue
             if not performed:
                 story.perform()
             performed = True
-            story.expect(text.removeprefix("=> "))
-        except Exception as error:
-            error.add_note(f"{place}: {text}")
-            raise
+            story.expect(line.text.removeprefix("=> "))
     assert performed, "the story expects nothing"
     story.finish()

@@ -10,8 +10,9 @@ from functools import partial
 from typing import Any
 
 import pytest
+from tests.kit.cases import find_form, read_form
 from tests.kit.rigs import VirtualLine
-from tests.kit.servo_cases import Case, do_one
+from tests.kit.servo_cases import Case
 
 from dxlrun.cli.tools.servo import VERBS, VerbCall
 from dxlrun.dynamixel.tools.one_servo import OneServo
@@ -80,8 +81,10 @@ class ToolCase(Case):
 
     def follow(self, line: str) -> None:
         if not line.startswith("=>"):
-            do_one(STEPS, line, self)
-        elif not do_one(EXPECTATIONS, line[2:].strip(), self, optional=True):
+            read_form(STEPS, line)(self)
+        elif check := find_form(EXPECTATIONS, line[2:].strip()):
+            check(self)
+        else:
             self.expect_report(line[2:].strip())
 
     def do(self, act: Callable[[], object]) -> None:

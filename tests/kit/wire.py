@@ -9,6 +9,7 @@ from typing import Literal, NamedTuple
 
 from tests.kit.packets import crc
 
+from dxlrun.plan.robot_plan import Plan
 from dxlsim.bus.ledger import LedgerEntry
 from dxlwire.bus_plan import BusPlan, ServoPlan
 
@@ -163,6 +164,19 @@ def values_written(
     for t_ns, servo, first, data in all_writes([one for one in entries if one.bus == bus.name], bus):
         if first <= address and address + size <= first + len(data):
             yield t_ns, servo, int.from_bytes(data[address - first :][:size], "little", signed=signed)
+
+
+def changes(
+    entries: Sequence[LedgerEntry], plan: Plan, address: int, size: int = 4
+) -> dict[int, list[tuple[float, int]]]:
+    """Return what was written into an item, by servo ID: time (s) and value, as often as it changed."""
+    found: dict[int, list[tuple[float, int]]] = {}
+    for bus in plan.buses:
+        for t_ns, servo, value in values_written(entries, bus, address, size, signed=True):
+            known = found.setdefault(servo, [])
+            if not known or known[-1][1] != value:
+                known.append((t_ns * 1e-9, value))
+    return found
 
 
 def written(sent: Sequence[Instruction], bus: BusPlan, item: Item) -> Iterator[tuple[int, ServoPlan, int]]:

@@ -7,12 +7,9 @@ import pytest
 from msgspec.structs import replace
 from tests.kit.kept_events import Events
 from tests.kit.line_faults import turn_by_hand
-from tests.kit.sampled_run import SampledRun
-from tests.kit.stories import send
-from tests.kit.wire import all_writes
+from tests.kit.virtual_run import VirtualRun, send, torque
 
 from dxlrun.channels.answers import Refusal
-from dxlrun.channels.commands import CommandMessage
 from dxlrun.channels.cycle import Commands, States
 from dxlrun.channels.event_records import EventCode, Severity
 from dxlrun.compile.simulation import simulation_of
@@ -20,7 +17,6 @@ from dxlrun.errors import StartUpError
 from dxlrun.features.mechanics.joint_arrays import CoupledJointArrays
 from dxlrun.features.mechanics.joint_hardware import CouplingCheck
 from dxlrun.run import virtual_run
-from dxlrun.run.virtual_run import VirtualRobot
 
 pytestmark = pytest.mark.long
 
@@ -43,17 +39,6 @@ policies: {on_returned_servo: hold}
 """
 
 
-def written(robot, servo, *addresses):
-    """Return when a servo was told to write which bytes to an address."""
-    entries, (bus,) = robot.ledger.entries, robot.plan.buses
-    return [(t, data) for t, one, at, data in all_writes(entries, bus) if one == servo and at in addresses]
-
-
-def torque(robot, servo, after_ns=0, before_ns=1 << 62):
-    """Return what was written to torque enable (64) of a servo in a time."""
-    return [data[0] for t, data in written(robot, servo, 64) if after_ns < t < before_ns]
-
-
 def test_servos_that_disagree_are_refused_before_any_gets_torque(plan, monkeypatch):
     right = plan()
     (bus,) = right.buses
@@ -63,15 +48,15 @@ def test_servos_that_disagree_are_refused_before_any_gets_torque(plan, monkeypat
     )
     wrong = replace(right, buses=(replace(bus, servos=servos),))
     monkeypatch.setattr(virtual_run, "simulation_of", lambda _: simulation_of(right))
-    robot = VirtualRobot(wrong)
+    robot = VirtualRun(wrong)
     with pytest.raises(StartUpError) as caught:
         robot.run()
     assert "the servos of hip disagree by 8.0 deg, more than its tolerance of 3.0 deg" in str(caught.value)
     assert "ID 3 on bus main reports 8.0 deg, ID 2 on bus main reports 0.0 deg" in str(caught.value)
-    assert not any(any(torque(robot, servo)) for servo in range(1, 8))
+    assert not any(on for servo in range(1, 8) for _, on in robot.sent(servo, "torque_enable"))
     couplings = tuple(replace(one, tolerance=math.radians(9)) for one in wrong.mechanics.couplings)
     tolerant = replace(wrong, mechanics=replace(wrong.mechanics, couplings=couplings))
-    assert VirtualRobot(tolerant).run().reason == "ended"
+    assert VirtualRun(tolerant).run().reason == "ended"
 
 
 def test_servos_that_begin_to_disagree_in_the_run_are_one_event_until_they_agree(plan):
@@ -97,19 +82,11 @@ def test_servos_that_begin_to_disagree_in_the_run_are_one_event_until_they_agree
 
 
 def test_a_wrist_outside_its_limits_is_refused_though_each_servo_is_within_its_range(plan):
-    robot = VirtualRobot(plan())
+    robot = VirtualRun(plan())
     for servo, angle in ((5, 80), (6, -80)):  # pitch at 80 deg, roll at 0
         turn_by_hand(robot.buses[0].servo(servo), math.radians(180 + angle))
     with pytest.raises(StartUpError, match=r"pitch \(ID 5 and 6 on bus main\) is at 80.0 deg, outside"):
         robot.run()
-
-
-def ask_torque(robot, joint, *wanted):
-    """Let a client ask for the torque of a joint, each at its time, ms."""
-    for number, (ms, on) in enumerate(wanted, 1):
-        data = f'{{"joints": ["{joint}"], "on": {on}, "release": true}}'.encode()
-        command = CommandMessage(number, "", "torque", data, "anna")
-        robot.buses[0].at(ms * 1_000_000, partial(robot.inbox.waiting.append, command))
 
 
 @pytest.mark.parametrize(
@@ -123,23 +100,23 @@ def test_torque_comes_back_within_limits_only_and_if_servos_agree(plan, monkeypa
     right = plan()
     # without what couples them, as where a horn has slipped
     monkeypatch.setattr(virtual_run, "simulation_of", lambda _: replace(simulation_of(right), mechanisms=()))
-    robot = VirtualRobot(plan(duration_s=1.4))
-    (bus,) = robot.buses
-    ask_torque(robot, joint, (300, "false"), (1000, "true"))
+    robot = VirtualRun(plan(duration_s=1.4))
+    for ms, on in ((300, False), (1000, True)):
+        robot.post_at(ms, torque([joint], on=on, release=True))
     for servo, angle in moved.items():
-        bus.at(600_000_000, partial(turn_by_hand, bus.servo(servo), math.radians(angle)))
+        robot.at(600, partial(turn_by_hand, robot.buses[0].servo(servo), math.radians(angle)))
     robot.run()
-    answer = robot.inbox.answers[2]
+    answer = robot.answer(2)
     assert isinstance(answer, Refusal)
     assert answer.text.count(problem) == 1
     for servo in moved:
-        assert 1 not in torque(robot, servo, 200_000_000)
+        assert not any(on for ms, on in robot.sent(servo, "torque_enable") if ms > 200)
 
 
 @pytest.mark.parametrize(("pitch", "roll"), [(0, 0), (38, -57), (-38, 58), (30, 50)])
 def test_servos_of_a_transmission_may_cross_raw_0(tmp_path, pitch, roll):
-    run = SampledRun(tmp_path, CROSSING, 4.0)
-    left, right = (run.bus.servo(number) for number in (1, 2))
+    run = VirtualRun.of_text(tmp_path, CROSSING, 4.0)
+    left, right = (run.buses[0].servo(number) for number in (1, 2))
 
     def angles(pitch, roll):
         return 10 + (pitch + roll), 350 - (pitch - roll)
@@ -158,7 +135,7 @@ def test_servos_of_a_transmission_may_cross_raw_0(tmp_path, pitch, roll):
     run.ask(500, send("neck", "positions", 0.3, -0.7))
     run.fault("brownout servo=1 at=2s for=200ms")
     run.at(3900, lambda: found.append(off(math.degrees(0.3), math.degrees(-0.7))))
-    log = run.run()
+    log = run.finish()
     assert max(found) < 1.5
     assert found[0] < 0.1
     assert log.cycles["position"][5] == pytest.approx([math.radians(pitch), math.radians(roll)], abs=0.002)

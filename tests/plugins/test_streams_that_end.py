@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.kit.sampled_run import SampledRun
-from tests.kit.stories import send, silence
+from tests.kit.virtual_run import VirtualRun
 
 from dxlrun import Controller, Floats, LogReader, open_log
 from dxlrun_controllers.plugin import dxlrun_controllers
@@ -140,26 +139,23 @@ def robot_text(kind: str, entry: Entry) -> str:
     return json.dumps(robot)
 
 
-def run(folder: Path, kind: str, entry: Entry, *, lease_s: float = LEASE_S) -> SampledRun:
+def run(folder: Path, kind: str, entry: Entry, *, lease_s: float = LEASE_S) -> VirtualRun:
     """Return the run of a stream that ends, before it begins."""
-    sampled = SampledRun(folder, robot_text(kind, entry), END * PERIOD_S)
+    sampled = VirtualRun.of_text(folder, robot_text(kind, entry), END * PERIOD_S)
+    sampled.sample(sampled.servos.values(), PERIOD_S * 1000)
     to, command = "own" if entry.kind else "mover", entry.kind or "positions"
-    plan = next(one for one in sampled.plan.loop.controllers if one.name == to)
-    receiver = controller_of(plan.type)
-    parameters = receiver.Parameters.model_validate_json(plan.parameters)
     for cycle in range(FIRST, LAST + 1, 2):
-        fields = receiver.Commands[command].model_validate(entry.fields((cycle - FIRST) * PERIOD_S))
-        numbers = receiver.prepare(command, fields, parameters)
-        sampled.ask(cycle * PERIOD_S * 1000, send(to, command, *numbers, lease_ns=round(lease_s * 1e9)))
+        fields = entry.fields((cycle - FIRST) * PERIOD_S)
+        sampled.command(cycle * PERIOD_S * 1000, to, command, fields, lease_s)
     return sampled
 
 
-def shafts(sampled: SampledRun) -> Floats:
+def shafts(sampled: VirtualRun) -> Floats:
     """Run; return the angles of the shafts, rad, a row each period of the loop."""
-    result = sampled.robot.run()
+    result = sampled.run()
     assert (result.reason, result.detail) == ("ended", ""), result
     began_ms = open_log(sampled.path).columns("/cycle", "scheduled_ns")["scheduled_ns"][0] / 1e6
-    return np.array([sampled.shaft(joint, began_ms) for joint in JOINTS]).T
+    return np.array([sampled.shaft(sampled.servos[joint], began_ms) for joint in JOINTS]).T
 
 
 def assert_topics_continue(log: LogReader, kind: str, entry: Entry, gap_s: float = 0.0) -> None:
@@ -202,7 +198,7 @@ def test_topics_outlive_a_stream_and_its_joints_are_held(tmp_path, kind, entry):
 def test_topics_outlive_a_lost_joint_and_the_other_one_is_held(tmp_path, kind, entry):
     """Efforts and PWM continue, as without them what they hold would fall."""
     sampled = run(tmp_path, kind, entry, lease_s=0.0)
-    silence(sampled.robot, [2], *(1000 * at for at in LOST_S))
+    sampled.silence([2], *(1000 * at for at in LOST_S))
     shoulder = shafts(sampled)[:, 0]
     assert_topics_continue(open_log(sampled.path), kind, entry, gap_s=0.1)  # until a servo counts as lost
     lost, back = (round(at / PERIOD_S) for at in LOST_S)

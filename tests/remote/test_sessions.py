@@ -14,14 +14,13 @@ answered as `loop answers` has it: a completion, or a refusal with its code.
 
 import json
 import math
-import re
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
-from tests.kit.cases import TextCase, case_parameters
+from tests.kit.cases import TextCase, case_parameters, fits, place_of, read_form
 from tests.remote.conftest import Desk
 
 from dxlrun.channels.answers import Code, Completion, Refusal
@@ -42,7 +41,7 @@ def is_part(wanted: Any, found: Any) -> bool:
         case list():
             return len(wanted) == len(found) and all(map(is_part, wanted, found))
         case str() if "..." in wanted:
-            return re.fullmatch(".*".join(map(re.escape, wanted.split("..."))), found) is not None
+            return fits(found, wanted)
         case float():
             return bool(found == pytest.approx(wanted, abs=1e-6))
     return bool(wanted == found)
@@ -151,10 +150,6 @@ def test_session(desk_of: Any, case: TextCase) -> None:
     session.activate(" ".join(one.name for one in session.plan.controllers if one.active))
     for array in (*session.desk.record.goals.values, session.desk.record.states.position):
         array.fill(math.nan)
-    for place, text, _ in case.lines:
-        found = next((act, one) for words, act in HAPPENINGS.items() if (one := re.fullmatch(words, text)))
-        try:
-            found[0](session, *found[1].groups())
-        except Exception as error:
-            error.add_note(f"{place}: {text}")
-            raise
+    for line in case.lines:
+        with place_of(line):
+            read_form(HAPPENINGS, line.text)(session)

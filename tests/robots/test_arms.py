@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from tests.kit.clients import Ask, steered
+from tests.kit.virtual_run import VirtualRun
 
 from dxlrun.channels.event_records import EventCode
 
@@ -66,9 +66,10 @@ def desired(t: float, begun: float) -> np.ndarray:
     ],
 )
 def test_a_trajectory_without_positions_is_followed(tmp_path, way, commands, moving, at_rest):
-    (tmp_path / "arm.yaml").write_text(ARM + WAYS[way])
-    ask = Ask(0.5, "arm", "trajectory", points(*LIFTED))
-    log = steered(tmp_path, tmp_path / "arm.yaml", 4.5, [ask]).log
+    run = VirtualRun.of_text(tmp_path, ARM + WAYS[way], 4.5)
+    run.command(500, "arm", "trajectory", points(*LIFTED))
+    log = run.finish()
+    run.require_done()
     (end,) = [json.loads(event.data) for event in log.events if event.code == EventCode.GOAL_ENDED]
     assert end["status"] == "reached"
     cycles = log.cycles

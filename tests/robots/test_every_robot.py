@@ -4,12 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.kit.clients import command_of, played
-from tests.kit.examples import as_parameters
+from tests.kit.examples import as_parameters, command_of
+from tests.kit.virtual_run import VirtualRun
 
 from dxlrun.compile.robot_compiler import compile_files
-from dxlrun.testing import simulated_robot
-from dxlrun_analysis.replay import replay_log
 from dxlwire.joint_unit import LINEAR
 
 pytestmark = pytest.mark.long
@@ -36,8 +34,7 @@ def test_every_robot_compiles_and_has_motions(path, tmp_path):
     }
     if path not in {command_of(motion).robot for motion in MOTIONS}:
         assert path.stem in others
-        simulated_robot(path, duration_s=0.5, log=tmp_path / "run.mcap").run()
-        assert replay_log(tmp_path / "run.mcap").same
+        VirtualRun(path, tmp_path / "run.mcap", duration_s=0.5).finish()
 
 
 @pytest.mark.parametrize("path", as_parameters(MOTIONS))
@@ -46,20 +43,22 @@ def test_every_motion_runs_by_the_command_that_it_names(path, tmp_path):
     assert command.motion == path
     plan = compile_files(command.robot, command.arguments, [path]).plan
     assert plan.loop.end_ns is not None
-    run = played(tmp_path, command, min(LONGEST_S, plan.loop.end_ns * 1e-9))
+    whole_s = plan.loop.end_ns * 1e-9
+    options = {"arguments": command.arguments, "play": [path], "duration_s": min(LONGEST_S, whole_s)}
+    run = VirtualRun(command.robot, tmp_path / "run.mcap", **options)
+    log = run.finish()
 
-    result, cycles = run.robot.result, run.log.cycles
-    assert replay_log(run.log.path).same
-    assert (result.reason, result.detail, result.skipped, run.robot.failures) == ("ended", "", 0, ())
+    result, cycles = run.result, log.cycles
+    assert (result.detail, result.skipped, run.failures) == ("", 0, ())
     assert cycles["valid"].all()
     ends = {command.controller: command for command in plan.loop.commands}
     assert ends
     for controller in plan.loop.controllers:
-        rows = [run.log.joints.index(joint) for joint in controller.joints if controller.name in ends]
+        rows = [log.joints.index(joint) for joint in controller.joints if controller.name in ends]
         least = [0.01 if plan.loop.joints[row].unit is LINEAR else 0.3 for row in rows]  # m, rad
         travel = np.ptp(cycles["position"][:, rows], axis=0)
         assert not rows or (travel > least).any()  # each controller that is played moves something
-    for bus, servos in zip(run.robot.buses, plan.buses, strict=True):
+    for bus, servos in zip(run.buses, plan.buses, strict=True):
         for servo in servos.servos:
             assert not bus.servo(servo.servo_id).torque_on
     # a limit of the position, never of the step in the first second, would be a mistake of the motion

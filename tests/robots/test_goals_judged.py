@@ -3,10 +3,9 @@
 import re
 
 import pytest
-from tests.kit.stories import Clients, prepared
+from tests.kit.virtual_run import VirtualRun
 
 from dxlrun.channels.event_records import EventCode
-from dxlrun.testing import read_log, simulated_robot
 
 BUSES = """
 buses:
@@ -22,23 +21,18 @@ def test_a_joint_that_shuts_itself_down_before_its_goal_is_judged_has_not_reache
 ):
     """Its reply reports the error, so its torque is in doubt, although it still stands at the goal."""
     text = BUSES.replace("2.0", str(protocol)).replace("XM430-W350", model).replace("{kind: direct}", "{}")
-    file = tmp_path / "robot.yaml"
-    file.write_text(f"name: arm{text}loop: {{rate: 50}}\njoints: {{a: {{id: 1}}}}\ncontrollers:\n"
-                   "  arm: {type: joint_trajectory_controller, joints: [a]}\n")  # fmt: skip
+    text = f"name: arm{text}loop: {{rate: 50}}\njoints: {{a: {{id: 1}}}}\ncontrollers:\n"
+    text += "  arm: {type: joint_trajectory_controller, joints: [a]}\n"
 
     def run(overloads_ms: float | None) -> tuple[str, float]:
-        log = tmp_path / "log.mcap"
-        log.unlink(missing_ok=True)
-        robot = simulated_robot(file, duration_s=2.8, log=log)
-        points = [{"positions": [0.5], "time": 1.0}]
-        Clients(robot, {50: [prepared(robot, "arm", "trajectory", points=points)]})
+        one = VirtualRun.of_text(tmp_path, text, 2.8)
+        one.command(1000, "arm", "trajectory", {"points": [{"positions": [0.5], "time": 1.0}]})
         if overloads_ms is not None:
-            robot.buses[0].at(round(overloads_ms * 1e6), robot.buses[0].servo(1).trigger_overload)
-        robot.run()
-        (end,) = [event for event in read_log(log).events if event.code == EventCode.GOAL_ENDED]
+            one.at(overloads_ms, one.servos["a"].trigger_overload)
+        (end,) = [event for event in one.finish().events if event.code == EventCode.GOAL_ENDED]
         return end.text, end.t_ns / 1e6
 
-    text, ended_ms = run(None)
-    assert "reached" in text
-    text, _ = run(ended_ms - before_ms)
-    assert re.match(r"goal 1 aborted: after .* s, joint a \(ID 1 on bus main\) is limp", text)
+    reached, ended_ms = run(None)
+    assert "reached" in reached
+    aborted, _ = run(ended_ms - before_ms)
+    assert re.match(r"goal 1 aborted: after .* s, joint a \(ID 1 on bus main\) is limp", aborted)

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tests.kit.campaigns import campaign
+from tests.kit.virtual_run import VirtualRun, replayed
 
-from dxlrun.testing import read_log, simulated_robot
-from dxlrun_analysis.replay import replay_log
+from dxlrun.testing import read_log
 from dxlsim.motion import mechanics
 
 ROBOT = """\
@@ -55,17 +55,16 @@ def run(case: Case, folder: Path, seconds: float, *, hot: bool, governed: bool) 
     Returns:
         The highest temperature, whether the servo tripped, and the log.
     """
-    path, log = folder / "robot.yaml", folder / f"{governed}.mcap"
     into = ", into: governor" if governed else ""
-    path.write_text(ROBOT.format(**vars(case), into=into, governed=str(governed).lower()))
-    robot = simulated_robot(path, duration_s=seconds, log=log)
-    servo = robot.buses[0].servo(1)
+    text = ROBOT.format(**vars(case), into=into, governed=str(governed).lower())
+    one = VirtualRun.of_text(folder, text, seconds)
     if hot:
-        servo.set_temperature(case.limit - 9.0)  # above `warn`: some of its torque is taken
-    assert robot.run().detail == ""
-    read = read_log(log)
+        one.servos["j"].set_temperature(case.limit - 9.0)  # above `warn`: some of its torque is taken
+    read = read_log(one.logged())
+    assert one.result is not None
+    assert one.result.detail == ""
     tripped = any("overheating error" in event.text for event in read.events)
-    return float(np.nanmax(read.cycles["temperature"])), tripped, log
+    return float(np.nanmax(read.cycles["temperature"])), tripped, read.path
 
 
 def check_governor_prevents_trip(
@@ -91,20 +90,15 @@ def check_governor_prevents_trip(
     return log
 
 
-def check_replay(log: Path) -> None:
-    report = replay_log(log)
-    assert (report.different, report.compared) == (0, report.cycles)
-
-
 @pytest.mark.parametrize("case", CASES[::2], ids=lambda case: case.model)
 def test_hot_servo_trips_without_a_governor_and_not_with_one(case, tmp_path):
     log = check_governor_prevents_trip(case, (0.1, 1.0), tmp_path, 18.0, hot=True)
     if case.protocol == 2.0:  # one replay is enough at each commit
-        check_replay(log)
+        replayed(log)
 
 
 @campaign(ci=0, night=600, release=600)
 @pytest.mark.parametrize("heating", [(1.0, 1.0), (0.5, 1.0), (1.0, 0.5), (2.0, 2.0)])
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.model)
 def test_cold_servo_trips_without_a_governor_and_not_with_one(case, heating, tmp_path, amount):
-    check_replay(check_governor_prevents_trip(case, heating, tmp_path, amount, hot=False))
+    replayed(check_governor_prevents_trip(case, heating, tmp_path, amount, hot=False))

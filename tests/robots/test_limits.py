@@ -5,13 +5,11 @@ import math
 from pathlib import Path
 
 import pytest
-from tests.kit.clients import steered
 from tests.kit.line_faults import turn_by_hand
-
-from dxlrun.run.virtual_run import VirtualRobot
+from tests.kit.virtual_run import VirtualRun
 
 LIMIT = math.radians(60)
-LOOK_NS = 50_000_000
+LOOK_MS = 50
 ROBOT = """\
 name: one
 buses:
@@ -28,26 +26,15 @@ policies: {exit_timeout: 20 s, on_exit: hold}
 
 def test_a_joint_beyond_its_limit_is_driven_back_slowly_by_its_effort_and_by_hold(tmp_path: Path) -> None:
     """A push sends it beyond; the servo goes on by itself when the run is over."""
-    angles = []
-
-    def look(robot: VirtualRobot, t_ns: int) -> None:
-        servo = robot.buses[0].servo(1)
-        servo.advance_to(t_ns)
-        angles.append(servo.shaft_angle - math.pi)
-
-    def push(robot: VirtualRobot) -> None:
-        servo = robot.buses[0].servo(1)
-        robot.buses[0].at(300_000_000, lambda: turn_by_hand(servo, math.pi + LIMIT + 0.5))
-        for t_ns in range(300_000_001, 600_000_000, LOOK_NS):
-            robot.buses[0].at(t_ns, lambda t_ns=t_ns: look(robot, t_ns))
-
-    (tmp_path / "robot.yaml").write_text(ROBOT)
-    robot = steered(tmp_path, tmp_path / "robot.yaml", 0.5, before=push).robot
-    end_ns = robot.clock.now_ns()
-    for t_ns in range(end_ns, end_ns + 2_000_000_000, LOOK_NS):
-        look(robot, t_ns)
-    assert robot.buses[0].servo(1).torque_on
+    run = VirtualRun.of_text(tmp_path, ROBOT, 0.5)
+    servo = run.servos["arm"]
+    run.at(300, lambda: turn_by_hand(servo, math.pi + LIMIT + 0.5))
+    run.sample([servo], LOOK_MS, 300.001)
+    run.finish()
+    run.buses[0].advance_to(run.clock.now_ns() + 2_000_000_000)
+    angles = run.shaft(servo) - math.pi
+    assert servo.torque_on
     assert angles[0] == pytest.approx(LIMIT + 0.5, abs=0.01)
     assert angles[-1] == pytest.approx(LIMIT, abs=0.01)
     steps = [before - after for before, after in itertools.pairwise(angles)]
-    assert max(steps) < 0.6 * LOOK_NS * 1e-9
+    assert max(steps) < 0.6 * LOOK_MS * 1e-3

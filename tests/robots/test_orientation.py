@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from tests.kit.campaigns import campaign
+from tests.kit.virtual_run import VirtualRun, source_states
 
 from dxlrun.log.log_reader import Log, read_log
-from dxlrun.testing import simulated_robot
 
 pytestmark = pytest.mark.long
 
@@ -80,12 +80,9 @@ def turned(tmp_path: Path) -> Callable[..., Log]:
         physics: str = "independent",
     ) -> Log:
         (tmp_path / "gimbal.urdf").write_text(URDF)
-        robot, motion = tmp_path / "gimbal.yaml", tmp_path / "turn.yaml"
-        robot.write_text(ROBOT.format(errors=errors, keys=keys, physics=physics))
+        motion, text = tmp_path / "turn.yaml", ROBOT.format(errors=errors, keys=keys, physics=physics)
         motion.write_text(MOTION.format(yaw=pose[0], pitch=pose[1], roll=pose[2]))
-        one = simulated_robot(robot, play=[motion], duration_s=duration_s, log=tmp_path / "run.mcap")
-        assert one.run().detail == ""
-        return read_log(tmp_path / "run.mcap")
+        return read_log(VirtualRun.of_text(tmp_path, text, duration_s, play=[motion]).logged())
 
     return run
 
@@ -94,9 +91,8 @@ def errors(log: Log) -> tuple[Array, Array]:
     """Return by how much each cycle's orientation is off in all, and its vertical alone, deg."""
     from scipy.spatial.transform import Rotation
 
-    names = [f"{source}/{one}" for source, states in log.header.sources.items() for one in states]
-    first = names.index("imu/orientation.x")
-    found = Rotation.from_quat(log.cycles["source_state"][:, first : first + 4])
+    states = source_states(log)
+    found = Rotation.from_quat(np.transpose([states[f"imu/orientation.{axis}"] for axis in "xyzw"]))
     true = Rotation.from_euler("ZYX", log.cycles["position"])
     up = np.einsum("ni,ni->n", true.as_matrix()[:, 2], found.as_matrix()[:, 2])
     return np.degrees((true.inv() * found).magnitude()), np.degrees(np.arccos(np.clip(up, -1, 1)))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
-from tests.kit.clients import Ask, steered
+from tests.kit.virtual_run import VirtualRun
 
 pytestmark = pytest.mark.long
 
@@ -23,10 +23,13 @@ def messages(path: Path, topic: str) -> list[Any]:
 
 
 def test_a_base_drives_a_circle_and_knows_it(tmp_path):
-    asks = [Ask(0.1 + 0.1 * n, "base", "velocity", {"linear": 0.1, "angular": 1.0}) for n in range(60)]
-    run = steered(tmp_path, ROBOTS / "diff_drive.yaml", 8.0, asks)
+    run = VirtualRun(ROBOTS / "diff_drive.yaml", tmp_path / "run.mcap", duration_s=8.0)
+    for number in range(60):
+        run.command(100 + 100 * number, "base", "velocity", {"linear": 0.1, "angular": 1.0})
+    log = run.finish()
+    run.require_done()
 
-    odometry = messages(run.log.path, "/base/odometry")
+    odometry = messages(log.path, "/base/odometry")
     assert len(odometry) == pytest.approx(8.0 * 50, abs=3)
     assert odometry[0].header.frame_id == "odom"
     places = np.array([(m.pose.pose.position.x, m.pose.pose.position.y) for m in odometry])
@@ -35,7 +38,7 @@ def test_a_base_drives_a_circle_and_knows_it(tmp_path):
     assert distance == pytest.approx(0.1, abs=0.01)
     last = odometry[-1]
     assert last.twist.twist.linear.x == pytest.approx(0.0, abs=0.001)  # it has timed out
-    row = run.log.cycles["position"]
+    row = log.cycles["position"]
     left, right = (row[-1] - row[0]) * 0.033
     heading = 2 * math.atan2(last.pose.pose.orientation.z, last.pose.pose.orientation.w)
     assert math.remainder(heading - (right - left) / 0.16, math.tau) == pytest.approx(0.0, abs=1e-6)

@@ -5,8 +5,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.kit.clients import command_of, played
+from tests.kit.examples import command_of
+from tests.kit.virtual_run import VirtualRun
 
+from dxlrun.testing import Log
 from dxlsim.motion.motor import motor_of
 from dxlwire.control_table import find_table
 
@@ -19,9 +21,16 @@ REST = 3
 CASES = [("single_joint_step", "joint", "MX-64"), ("whole_body", "head_yaw_joint", "AX-12A")]
 
 
-def step(run: Any, joint: str) -> tuple[Any, Any, Any]:
+def play(folder: Path, name: str, seconds: float | None = None) -> Log:
+    """Run the command that a motion names; return its log."""
+    robot, arguments, motion = command_of(MOTIONS / f"{name}.yaml")
+    run = VirtualRun(robot, folder / "run.mcap", arguments=arguments, play=[motion], duration_s=seconds)
+    return run.finish()
+
+
+def step(log: Log, joint: str) -> tuple[Any, Any, Any]:
     """Return time since the step, s, position, rad, and speed, rad/s, of a joint from the step on."""
-    cycles, row = run.log.cycles, run.log.joints.index(joint)
+    cycles, row = log.cycles, log.joints.index(joint)
     t = (cycles["read_ns"] - cycles["scheduled_ns"][0]) * 1e-9 - STEP_S
     after = (t >= 0) & (t < STEP_S)
     return t[after], cycles["position"][after, row], cycles["velocity"][after, row]
@@ -29,7 +38,7 @@ def step(run: Any, joint: str) -> tuple[Any, Any, Any]:
 
 @pytest.mark.parametrize(("name", "joint", "model"), CASES)
 def test_a_step_of_the_position_alone_is_as_fast_as_the_servo_can(name, joint, model, tmp_path):
-    t, q, speed = step(played(tmp_path, command_of(MOTIONS / f"{name}_position.yaml")), joint)
+    t, q, speed = step(play(tmp_path, f"{name}_position"), joint)
     table = find_table(model, 1.0)
 
     fastest = motor_of(table).no_load_speed
@@ -41,8 +50,7 @@ def test_a_step_of_the_position_alone_is_as_fast_as_the_servo_can(name, joint, m
 
 def test_the_tracking_motion_keeps_its_time(tmp_path):
     """A motion that is sent by number, not by time, stretches: the thesis' old library by 5 s in 30 s."""
-    run = played(tmp_path, command_of(MOTIONS / "single_joint_tracking.yaml"), 10.0)
-    cycles = run.log.cycles
+    cycles = play(tmp_path, "single_joint_tracking", 10.0).cycles
     t = (cycles["read_ns"] - cycles["scheduled_ns"][0]) * 1e-9 - 1.0
     moving = t > 0.5
 

@@ -10,6 +10,7 @@ from tests.kit.cases import read_head
 from tests.kit.judges import log_has_every_byte, uncaused, unnoticed
 from tests.kit.line_faults import other_host
 from tests.kit.robots import CASES
+from tests.kit.virtual_run import VirtualRun, source_states
 
 from dxlrun import Controller, Interfaces, ParametersModel
 from dxlrun.channels.cycle import Torque
@@ -20,11 +21,9 @@ from dxlrun.compile import robot_compiler
 from dxlrun.control.controllers.plugin_loading import Offer, PlugIns, load_plugins
 from dxlrun.run import virtual_run
 from dxlrun.run.simulation_front import SimulationResult
-from dxlrun.testing import read_log, simulated_robot
-from dxlrun_analysis.replay import log_replay, replay_log
+from dxlrun.testing import simulated_robot
+from dxlrun_analysis.replay import log_replay
 from dxlrun_analysis.report import analyze_log
-from dxlsim.faults.fault import parse_fault
-from dxlsim.faults.script import FaultScript
 from dxlsim.messages import SimulationMessage
 from dxlsim.simulation_plan import SimulationConfig
 
@@ -88,19 +87,16 @@ def dozen(tmp_path, monkeypatch):
             f"  {name}: {{bus: main, id: {number}, model: XL430-W250, reference: 180 deg, direction: 1}}"
             for number, name in enumerate(JOINTS, 1)
         ]
-        path = tmp_path / "dozen.yaml"
-        path.write_text(HEAD.replace("JOINTS", ", ".join(JOINTS)) + "\n".join(lines) + "\n")
-        return simulated_robot(path, duration_s=duration_s, log=tmp_path / "run.mcap")
+        text = HEAD.replace("JOINTS", ", ".join(JOINTS)) + "\n".join(lines) + "\n"
+        return VirtualRun.of_text(tmp_path, text, duration_s)
 
     return build
 
 
-def test_the_log_is_the_ledger_and_a_lost_device_costs_the_servos_nothing(dozen, tmp_path):
+def test_the_log_is_the_ledger_and_a_lost_device_costs_the_servos_nothing(dozen):
     run = dozen(1.3)
-    faults = "silence servo=101 at=300ms for=150ms", "silence servo=43 at=320ms"
-    FaultScript([*map(parse_fault, faults)]).attach(run.buses)
-    run.run()
-    log = read_log(tmp_path / "run.mcap")
+    run.fault("silence servo=101 at=300ms for=150ms", "silence servo=43 at=320ms")
+    log = run.finish()
     log_has_every_byte(log, run.ledger.entries)
     assert unnoticed(log, run.ledger.entries) == []
     assert uncaused(log, run.ledger.entries) == []
@@ -130,8 +126,8 @@ def test_the_log_is_the_ledger_and_a_lost_device_costs_the_servos_nothing(dozen,
         (event.source, event.text.rpartition(" is ")[2]) for event in log.events
     }
     assert np.nanmax(cycles["device_command"][:, 0]) == 1.0
-    # the analysis, and a replay
-    found = analyze_log(tmp_path / "run.mcap")
+    # the analysis
+    found = analyze_log(log.path)
     (missing,) = (one for one in found.verdict.sentences if one.startswith("Replies are missing: "))
     assert "device 101 (foot) " in missing
     assert missing.endswith(" of 16 servos and devices answered every time.")
@@ -139,23 +135,20 @@ def test_the_log_is_the_ledger_and_a_lost_device_costs_the_servos_nothing(dozen,
     assert servos["foot"].device
     assert servos["foot"].lost > 0
     assert servos["joint_1"].lost == 0
-    replayed = replay_log(tmp_path / "run.mcap")
-    assert replayed.same, replayed
 
 
-def test_what_devices_measure_and_are_told_is_what_the_bus_has(dozen, tmp_path):
+def test_what_devices_measure_and_are_told_is_what_the_bus_has(dozen):
     run = dozen(0.3)
     foot = run.buses[0].device(101)
     foot.registers["register_5"] = 77
-    run.run()
-    values = dict(zip(run.record.layout.source_states, run.record.sources.values.tolist(), strict=True))
+    log = run.finish()
+    values = {name: rows[-1] for name, rows in source_states(log).items()}
     assert values["foot/force.y"] == 77
     assert values["imu/linear_acceleration.z"] == pytest.approx(9.80665)
     assert values["board/lamp"] == 1
     assert run.buses[0].device(42).registers["register_8"] == 77
     assert run.buses[0].device(42).registers["led"] == 0  # its safe value, at the end
-    last = read_log(tmp_path / "run.mcap").cycles[-1]
-    assert last["device_command"].tolist() == [1.0, 77.0]
+    assert log.cycles[-1]["device_command"].tolist() == [1.0, 77.0]
 
 
 ROBOT, _, BOARD = read_head(CASES / "boards.txt").partition("---- mine.toml\n")
@@ -242,9 +235,7 @@ controllers:
 def test_an_imu_on_a_link_feels_how_the_link_is_and_turns(tmp_path):
     """About y by q: gravity in the link's axes is (-g sin q, 0, g cos q), the rate is dq about y."""
     (tmp_path / "nodding.urdf").write_text(URDF)
-    path = tmp_path / "nodding.yaml"
-    path.write_text(ON_A_LINK)
-    run = simulated_robot(path, duration_s=0.8)
+    run = VirtualRun.of_text(tmp_path, ON_A_LINK, 0.8)
     bus = run.buses[0]
     seen: list[tuple[float, float, float, float]] = []
 

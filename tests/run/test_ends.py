@@ -1,15 +1,15 @@
 """Ways out of a run: the cases of ends.txt, judged by ledger, processes and log."""
 
 import os
-import re
 import signal
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
 from tests.kit.awaited import until
-from tests.kit.cases import TextCase, read_cases
+from tests.kit.cases import TextCase, fits, read_cases, read_form
 from tests.kit.live_run import MOST_HELD, ROBOT, LiveRuns, Running, together
 
 from dxlrun_analysis.report import analyze
@@ -98,9 +98,7 @@ def perform(run: Running, line: str) -> None:
             run.signal({"interrupt": signal.SIGINT, "terminate": signal.SIGTERM}[verb])
 
 
-def has(text: str, pattern: str) -> bool:
-    """Search a text for one in which `...` stands for anything."""
-    return bool(re.search(".*".join(map(re.escape, pattern.split("..."))), text, re.DOTALL))
+has = partial(fits, whole=False)
 
 
 class Judge:
@@ -113,12 +111,7 @@ class Judge:
 
     def sees(self, seen: str) -> bool:
         """Check one line of a case."""
-        if seen in EXCEPTIONS:
-            return True
-        for words, check in CHECKS.items():
-            if (found := re.fullmatch(words, seen)) is not None:
-                return bool(check(self, *found.groups()))
-        raise AssertionError(f"not one of {list(CHECKS)}")
+        return seen in EXCEPTIONS or bool(read_form(CHECKS, seen)(self))
 
     def reports(self, pattern: str) -> bool:
         return any(has(event.text, pattern) for event in self.run.log().events)

@@ -4,12 +4,11 @@ from pathlib import Path
 
 import pytest
 from msgspec.structs import replace
+from tests.kit.virtual_run import VirtualRun
 from tests.kit.wire import taken_apart, writes
 
 from dxlrun.compile.robot_compiler import compile_files
-from dxlrun.log.log_reader import read_log
 from dxlrun.run.kept_files import state_directory
-from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun_analysis.replay import replay_log
 
 ROBOTS = Path(__file__).parents[2] / "robots"
@@ -34,8 +33,8 @@ def test_servos_of_a_joint_get_no_packet(tmp_path, name, joint, motion):
     whole = compile_files(*files).plan
     plan = compile_files(*files, 1_500_000_000, without=[joint]).plan
     absent = {servo.servo_id for _, servo in whole.servos_by_joint[joint]}
-    robot = VirtualRobot(plan, log=tmp_path / "run.mcap")
-    assert robot.run().reason == "ended"
+    robot = VirtualRun(plan, tmp_path / "run.mcap")
+    log = robot.finish()
     (bus,) = robot.buses
     addressed: set[int] = set()
     for sent in taken_apart(bus.ledger.entries, plan.buses[0].protocol):
@@ -45,8 +44,8 @@ def test_servos_of_a_joint_get_no_packet(tmp_path, name, joint, motion):
             addressed |= {*sent.parameters[4:]}
     assert addressed >= {servo.servo_id for servo in plan.buses[0].servos}
     assert not addressed & absent
-    assert joint not in read_log(tmp_path / "run.mcap").joints
-    assert replay_log(tmp_path / "run.mcap", arguments={"port": "sim"}).same
+    assert joint not in log.joints
+    assert replay_log(log.path, arguments={"port": "sim"}).same
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)

@@ -10,8 +10,7 @@ import pytest
 from msgspec.structs import force_setattr
 from tests.kit.cases import read_head
 from tests.kit.line_faults import truncate_next, watch_instructions
-from tests.kit.sampled_run import SampledRun
-from tests.kit.stories import switch
+from tests.kit.virtual_run import VirtualRun, switch
 
 from dxlrun.channels.answers import Code, Refusal
 from dxlrun.errors import StartUpError
@@ -21,22 +20,21 @@ ROBOT = read_head(Path(__file__).with_name("stories") / "policies.txt").partitio
 TICK = math.radians(300 / 1023)
 HOME = round(math.radians(170) / TICK)  # of pan
 POSE = "[{pose: home, speed: 60 deg/s}, limp]"
-TORQUE_ENABLE, GOAL = 24, 30
 START_MS = 200
 """Time of a stop since the loop's first deadline, or more"""
 
 
-class Three(SampledRun):
+class Three(VirtualRun):
     """The robot with policies."""
 
     def has_torque(self) -> set[bool]:
         """Return by what servos were sent which have torque."""
-        sent = [self.goals(joint, TORQUE_ENABLE, 1) for joint in self.servos]
+        sent = [self.sent(servo.servo_id, "torque_enable") for servo in self.servos.values()]
         return {bool(one and one[-1][1]) for one in sent}
 
     def sent_goals(self, joint: str) -> list[tuple[float, int]]:
         """Return the goals that a joint got after its torque: ms and ticks."""
-        return self.goals(joint, GOAL, 2)[1:]
+        return self.sent(self.servos[joint].servo_id, "goal_position")[1:]
 
 
 @pytest.fixture
@@ -47,7 +45,7 @@ def built(tmp_path: Path) -> Callable[..., Three]:
         seconds: float = 60.0, more: str = "", change: tuple[str, str] = ("", ""), **policies: str
     ) -> Three:
         own = ", ".join(f"{name}: {policy}" for name, policy in (policies | {"exit_timeout": "4 s"}).items())
-        return Three(tmp_path, f"{ROBOT.replace(*change)}{more}policies: {{{own}}}\n", seconds)
+        return Three.of_text(tmp_path, f"{ROBOT.replace(*change)}{more}policies: {{{own}}}\n", seconds)
 
     return build
 
@@ -56,9 +54,9 @@ def test_controllers_are_deactivated_before_a_policy_moves_and_requests_are_refu
     active: list[int] = []
     acts["pair"] = lambda controller, time_ns: active.append(time_ns)
     run = built(on_exit=POSE)
-    run.at(START_MS, run.robot.stop.request)
+    run.at(START_MS, run.stop.request)
     run.ask(START_MS + 100, switch(deactivate=["pair"]))
-    masks = run.run("stopped").cycles["active"].tolist()
+    masks = run.finish("stopped").cycles["active"].tolist()
     during = masks[len(active) :]
     assert len(during) > 10
     assert set(during) == {0}
@@ -68,9 +66,9 @@ def test_controllers_are_deactivated_before_a_policy_moves_and_requests_are_refu
 
 def test_steps_are_cut_short_when_the_time_for_them_is_over(built):
     run = built(on_exit="[{pose: home, speed: 30 deg/s}, hold]")
-    run.at(START_MS, run.robot.stop.request)
+    run.at(START_MS, run.stop.request)
     force_setattr(run.plan.loop.policies, "limit_ns", 200_000_000)
-    assert run.robot.run().last == "hold"
+    assert run.run().last == "hold"
     sent = run.sent_goals("pan")
     assert sent[-1][0] < START_MS + 400
     assert sent[0][1] < sent[-1][1] < HOME
@@ -79,17 +77,17 @@ def test_steps_are_cut_short_when_the_time_for_them_is_over(built):
 
 def test_periods_are_skipped_behind_the_end_of_the_motions_too(built):
     run = built(0.2, on_exit=POSE)
-    hardware, clock = run.robot.robot.hardware, run.robot.clock
+    hardware, clock = run.robot.hardware, run.clock
     read, woken = hardware.read_states, []
 
     def slow():
-        woken.append(run.robot.record.woken_ns)
+        woken.append(run.record.woken_ns)
         if len(woken) == 22:
             clock.wait_until(clock.now_ns() + 90_000_000)
         read()
 
     hardware.read_states = slow
-    assert run.robot.run().skipped == 4
+    assert run.run().skipped == 4
     assert np.diff(woken[10:]).min() >= 20_000_000, "two cycles never follow each other in a burst"
 
 
@@ -102,10 +100,10 @@ def test_a_start_ends_when_a_servo_may_be_left_weak(built):
             Instruction.READ,
             b"\x22\x02",
         ):
-            truncate_next(run.bus, 7, 0)
+            truncate_next(run.buses[0], 7, 0)
 
-    watch_instructions(run.bus, lose_limit)
+    watch_instructions(run.buses[0], lose_limit)
     said = "tilt (ID 7 on bus main) did not answer when its torque limit was read"
     with pytest.raises(StartUpError, match=re.escape(said)):
-        run.robot.run()
+        run.run()
     assert run.has_torque() == {False}

@@ -22,30 +22,23 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 from tests.kit.laws import CONTROLLERS, Case, cases, chain_of
 from tests.kit.line_faults import turn_by_hand
 from tests.kit.selection import CHECKED_LESS
-from tests.kit.stories import replayed
+from tests.kit.virtual_run import MS, VirtualRun, ask, replayed
 
 from dxlrun.channels.answers import Refusal
-from dxlrun.channels.commands import LOOP, CommandMessage
 from dxlrun.channels.cycle import Torque
 from dxlrun.channels.event_records import EventCode
-from dxlrun.control.controllers.plugin_loading import load_plugins
 from dxlrun.plan.policy_plan import SLOW_SPEED
 from dxlrun.plan.robot_plan import Plan
-from dxlrun.remote.preparation import Preparation
-from dxlrun.testing import Log, VirtualRobot, plan_of, read_log
+from dxlrun.testing import Log, plan_of, read_log
 from dxlsim.bus.simulated_bus import SimulatedBus
-from dxlsim.faults.fault import parse_fault
-from dxlsim.faults.script import FaultScript
 from dxlsim.servo.simulated_servo import SimulatedServo
 from dxlwire.modes import Mode
 
-MS = 1_000_000
 TURN = math.radians(100)
 TICK = math.tau / 4096
 BEGUN_MS, LOST_MS, TURNED_MS = 100, 800, 950
@@ -216,23 +209,20 @@ def robot_text(kind: str, policy: str) -> tuple[str, tuple[Steered, ...]]:
     return text, ways
 
 
-class Story:
+class Story(VirtualRun):
     """A robot on virtual time, its clients, and a hand that turns its shafts."""
 
     def __init__(self, folder: Path, kind: str, policy: str = "hold") -> None:
         self.kind = kind
         plan, self.ways = compiled(kind, policy)
-        self.path = folder / "run.mcap"
-        self.robot = VirtualRobot(plan, log=self.path)
-        self.preparation = Preparation({joint.name: joint for joint in plan.loop.joints}, load_plugins())
+        super().__init__(plan, folder / "run.mcap")
         self.plans = {one.name: one for one in plan.loop.controllers}
-        self.rows = {joint.name: row for row, joint in enumerate(plan.loop.joints)}
         placed = {
             servo.row: (f"{servo.joint}, {planned.label(servo)}", bus.servo(servo.servo_id))
-            for bus, planned in zip(self.robot.buses, plan.buses, strict=True)
+            for bus, planned in zip(self.buses, plan.buses, strict=True)
             for servo in planned.servos
         }
-        self.servos: dict[str, SimulatedServo] = dict(placed.values())
+        self.by_name: dict[str, SimulatedServo] = dict(placed.values())
         self.shafts: dict[str, tuple[str, ...]] = {
             joint: tuple(
                 placed[servo][0] for servo in (plan.mechanics.servo_rows(row) if plan.mechanics else (row,))
@@ -242,7 +232,6 @@ class Story:
         """Names of the shafts of each joint's servos."""
         self.joints = [joint for one in self.ways for joint in one.joints]
         self.names = list(dict.fromkeys(name for joint in self.joints for name in self.shafts[joint]))
-        self.numbers = itertools.count(1)
         self.put: dict[str, float] = {}
         self.watched: list[list[float]] = []
         self.commanded_ms = math.inf
@@ -250,43 +239,26 @@ class Story:
         self.again: set[str] = set()
         """Controllers that began again where their joints were."""
 
-    @property
-    def now_ms(self) -> float:
-        return self.robot.clock.now_ns() / MS
+    def request(self, kind: str, **data: object) -> None:
+        self.post(ask(kind, data or None))
 
-    def at(self, ms: float, do: Callable[[], object]) -> None:
-        self.robot.buses[0].at(round(ms * MS), do)
-
-    def ask(self, kind: str, **data: object) -> int:
-        number = next(self.numbers)
-        encoded = msgspec.json.encode(data) if data else b""
-        self.robot.inbox.waiting.append(CommandMessage(number, LOOP, kind, encoded, "anna"))
-        return number
-
-    def command(self, other: bool = False) -> None:
+    def command_all(self, other: bool = False) -> None:
         """Let clients command every joint; of leaders, turn them by hand."""
         for what, plural in (("velocity", "velocities"), ("position", "positions")) if other else ():
             rows = [self.rows[joint] for one in self.ways if one.other == what for joint in one.joints]
             # A goal on the other side of 0 is never where a joint already is.
-            away = -np.copysign(0.9, self.robot.record.states.position[rows])
+            away = -np.copysign(0.9, self.record.states.position[rows])
             goals = away.tolist() if what == "position" else [0.9] * len(rows)
-            self._send(what, plural, {plural: goals})
+            self.post(self.prepared(what, plural, {plural: goals}))
         for one in self.ways:
             for kind, data in () if other else one.asks:
-                self._send(one.top, kind, data)
+                self.post(self.prepared(one.top, kind, data))
             if one.leader:
                 self.turn_leader(one, math.pi - 0.9)
 
-    def _send(self, controller: str, kind: str, data: dict[str, Any]) -> None:
-        prepared = self.preparation.command(
-            self.plans[controller], kind, json.dumps(data).encode(), units=False
-        )
-        number = next(self.numbers)
-        self.robot.inbox.waiting.append(CommandMessage(number, controller, kind, prepared.data, "anna"))
-
     def turn_leader(self, one: Steered, angle: float) -> None:
         (name,) = self.shafts[one.leader]
-        turn_by_hand(self.servos[name], angle)
+        turn_by_hand(self.by_name[name], angle)
 
     def turn(self, names: list[str] | None = None) -> None:
         """Turn shafts without torque by 100 deg, toward the middle of their range."""
@@ -294,19 +266,19 @@ class Story:
             for name in dict.fromkeys(name for joint in one.joints for name in self.shafts[joint]):
                 if name in self.put or (names is not None and name not in names):
                     continue
-                assert not self.servos[name].shaft.torque_on or names is not None, name
-                angle = self.servos[name].shaft.angle
+                assert not self.by_name[name].shaft.torque_on or names is not None, name
+                angle = self.by_name[name].shaft.angle
                 self.put_at(name, angle - math.copysign(TURN, angle - math.pi))
                 if one.leader:
                     self.turn_leader(one, math.tau - self.put[name])
 
     def put_at(self, name: str, angle: float) -> None:
         """Turn a shaft to an angle, rad, with the others that are on its axis."""
-        turn_by_hand(self.servos[name], angle)
+        turn_by_hand(self.by_name[name], angle)
         axis = next(names for names in self.shafts.values() if name in names)
         for other in axis if self.kind == "pairs" else (name,):
-            self.put[other] = self.servos[other].shaft.angle
-            turn_by_hand(self.servos[other], self.put[other])
+            self.put[other] = self.by_name[other].shaft.angle
+            turn_by_hand(self.by_name[other], self.put[other])
 
     def watch(self, until: Callable[[], bool], then: Callable[[], object]) -> None:
         """Watch the shafts from now on; when it is time, let clients command again."""
@@ -314,24 +286,20 @@ class Story:
             self.commanded_ms = self.now_ms
             then()
         elif self.now_ms > self.commanded_ms + FOLLOWED_MS:
-            self.robot.stop.request()
+            self.stop.request()
             return
-        angles = [self.servos[name].shaft.angle for name in self.names]
+        angles = [self.by_name[name].shaft.angle for name in self.names]
         (self.fast if self.commanded_ms < self.now_ms else self.watched).append(angles)
         self.at(self.now_ms + STEP_MS, lambda: self.watch(until, then))
 
     def all_have_torque(self) -> bool:
-        torque = self.robot.record.states.torque
+        torque = self.record.states.torque
         return all(torque[self.rows[joint]] == Torque.ON for joint in self.joints)
 
     def judge(self) -> None:
-        self.robot.run()
+        log = read_log(self.logged())
         assert self.commanded_ms < math.inf, "torque did not come back"
-        refused = {
-            number: answer.text
-            for number, answer in self.robot.inbox.answers.items()
-            if isinstance(answer, Refusal)
-        }
+        refused = [one.text for one in self.inbox.answers.values() if isinstance(one, Refusal)]
         assert not refused
         put = np.array([self.put[name] for name in self.names])
         off = np.abs(np.array(self.watched) - put).max(axis=0) / TICK
@@ -339,7 +307,7 @@ class Story:
         assert not moved
         assert len(self.watched) > 3
         self._judge_commanded()
-        self._judge_log(read_log(self.path))
+        self._judge_log(log)
 
     def _judge_commanded(self) -> None:
         """Every joint follows its clients again, those that are led to positions or by velocities slowly."""
@@ -385,15 +353,14 @@ def way(name: str, kinds: tuple[str, ...] = ROBOTS, policy: str = "hold"):
 
 
 def faults(story: Story, text: str) -> None:
-    for bus in ("b0", "b1", "b2"):
-        FaultScript([parse_fault(f"{text} bus={bus}")]).attach(story.robot.buses)
+    story.fault(*(f"{text} bus={bus}" for bus in ("b0", "b1", "b2")))
 
 
 def turned(story: Story, ms: float = TURNED_MS, *, watch: bool = True) -> None:
     """Turn the shafts, and watch them until all have torque; then clients command again."""
     story.at(ms, story.turn)
     if watch:
-        story.at(ms + 1, lambda: story.watch(story.all_have_torque, story.command))
+        story.at(ms + 1, lambda: story.watch(story.all_have_torque, story.command_all))
 
 
 def activated(story: Story, ms: float) -> None:
@@ -401,12 +368,12 @@ def activated(story: Story, ms: float) -> None:
 
     def again() -> None:
         tops = [name for one in story.ways for name in one.controllers]
-        story.ask("switch", activate=tops, deactivate=[])
+        story.request("switch", activate=tops, deactivate=[])
 
         def command() -> None:
-            mask = story.robot.record.active
+            mask = story.record.active
             if all(mask >> list(story.plans).index(name) & 1 for name in tops):
-                story.command()
+                story.command_all()
             else:
                 story.at(story.now_ms + STEP_MS, command)
 
@@ -423,7 +390,7 @@ def _(story: Story) -> None:
             story.put_at(name, math.pi + 0.4)
     story.put.clear()
     story.turn()
-    story.at(1, lambda: story.watch(lambda: story.robot.record.cycle > 5, story.command))
+    story.at(1, lambda: story.watch(lambda: story.record.cycle > 5, story.command_all))
 
 
 @way("return after a brown-out")
@@ -441,15 +408,15 @@ def _(story: Story) -> None:
 
 @way("reboot that a client requests", ("plain",))
 def _(story: Story) -> None:
-    story.at(LOST_MS, lambda: story.ask("reboot", joints=story.joints, release=True))
+    story.at(LOST_MS, lambda: story.request("reboot", joints=story.joints, release=True))
     activated(story, TURNED_MS)
 
 
 @way("torque that a client requests", ("plain", "protocol 1", "differential"))
 def _(story: Story) -> None:
-    story.at(LOST_MS, lambda: story.ask("torque", joints=story.joints, on=False, release=True))
+    story.at(LOST_MS, lambda: story.request("torque", joints=story.joints, on=False, release=True))
     activated(story, TURNED_MS)
-    story.at(TURNED_MS + 100, lambda: story.ask("torque", joints=story.joints, on=True))
+    story.at(TURNED_MS + 100, lambda: story.request("torque", joints=story.joints, on=True))
 
 
 @way("torque that a client requests while controllers are active", ("plain", "protocol 1"), policy="limp")
@@ -458,9 +425,9 @@ def _(story: Story) -> None:
     turned(story)
 
     def request() -> None:
-        torque = story.robot.record.states.torque
+        torque = story.record.states.torque
         if all(torque[story.rows[joint]] == Torque.OFF for joint in story.joints):
-            story.ask("torque", joints=story.joints, on=True)
+            story.request("torque", joints=story.joints, on=True)
         else:
             story.at(story.now_ms + STEP_MS, request)
 
@@ -469,13 +436,13 @@ def _(story: Story) -> None:
 
 @way("return in a pause", ("plain",))
 def _(story: Story) -> None:
-    story.at(LOST_MS - 50, lambda: story.ask("pause"))
+    story.at(LOST_MS - 50, lambda: story.request("pause"))
     faults(story, f"brownout at={LOST_MS}ms for=300ms")
     turned(story, watch=False)
 
     def go_on() -> None:
-        story.ask("resume")
-        story.at(story.now_ms + 200, story.command)
+        story.request("resume")
+        story.at(story.now_ms + 200, story.command_all)
 
     story.at(TURNED_MS + 1, lambda: story.watch(story.all_have_torque, go_on))
 
@@ -483,28 +450,28 @@ def _(story: Story) -> None:
 @way("another mode", ("plain", *COUPLED))
 def _(story: Story) -> None:
     leave = [name for one in story.ways for name in one.controllers]
-    story.at(LOST_MS, lambda: story.ask("switch", activate=["velocity", "position"], deactivate=leave))
+    story.at(LOST_MS, lambda: story.request("switch", activate=["velocity", "position"], deactivate=leave))
 
     def turn(bus: SimulatedBus) -> None:
         """Turn the shafts that have no torque after each packet: a change takes a millisecond or two."""
-        mine = [name for name in story.names if story.servos[name] in bus.servos]
-        story.turn([name for name in mine if not story.servos[name].shaft.torque_on])
+        mine = [name for name in story.names if story.by_name[name] in bus.servos]
+        story.turn([name for name in mine if not story.by_name[name].shaft.torque_on])
         if len(story.put) < len(story.names):
             bus.after(1, lambda: turn(bus))
 
     def ready() -> bool:
-        modes = story.robot.record.states.mode
+        modes = story.record.states.mode
         wanted = {joint: one.other for one in story.ways for joint in one.joints}
         changed = all(modes[story.rows[joint]] == Mode[mode.upper()] for joint, mode in wanted.items())
         return changed and story.all_have_torque()
 
     def watch() -> None:
-        story.watch(ready, lambda: story.command(other=True))
+        story.watch(ready, lambda: story.command_all(other=True))
 
     def stand() -> None:
-        story.put |= {name: story.servos[name].shaft.angle for name in story.names}
+        story.put |= {name: story.by_name[name].shaft.angle for name in story.names}
         until_ms = story.now_ms + 200
-        story.watch(lambda: story.now_ms > until_ms, lambda: story.command(other=True))
+        story.watch(lambda: story.now_ms > until_ms, lambda: story.command_all(other=True))
 
     def watch_when(is_time: Callable[[], bool], then: Callable[[], None], after_ms: float) -> None:
         if is_time():
@@ -515,7 +482,7 @@ def _(story: Story) -> None:
     if story.kind == "pairs":  # one servo holds the joint while the mode of the other one changes
         story.at(LOST_MS, lambda: watch_when(ready, stand, after_ms=200))  # until all have stopped
         return
-    for bus in story.robot.buses:
+    for bus in story.buses:
         story.at(LOST_MS, partial(turn, bus))
     story.at(LOST_MS, lambda: watch_when(lambda: len(story.put) == len(story.names), watch, after_ms=1))
 
@@ -541,7 +508,7 @@ def test_no_joint_moves_until_a_client_commands_it(tmp_path, record_property, na
     happens, _, policy = WAYS[name]
     story = Story(tmp_path, kind, policy)
     if name != "start":
-        story.at(BEGUN_MS, story.command)
+        story.at(BEGUN_MS, story.command_all)
     happens(story)
     story.judge()
     stayed = {one for each in story.ways for one in each.controllers} if name in RESTARTED else set()

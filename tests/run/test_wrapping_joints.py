@@ -3,7 +3,6 @@
 import itertools
 import json
 import math
-from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -12,13 +11,12 @@ import numpy as np
 import pytest
 from tests.kit.laws import chain_of
 from tests.kit.line_faults import turn_by_hand
+from tests.kit.virtual_run import VirtualRun
 from tests.run.test_torque_matrix import Steered, steered
 
 from dxlrun import nearest_turn
-from dxlrun.channels.commands import CommandMessage
-from dxlrun.control.controllers.plugin_loading import load_plugins
-from dxlrun.remote.preparation import Preparation
-from dxlrun.testing import VirtualRobot, simulated_robot
+from dxlrun.channels.cycle import Floats
+from dxlsim.servo.simulated_servo import SimulatedServo
 
 STEP = math.radians(2)
 MOST = math.radians(45)
@@ -60,7 +58,7 @@ def _exact() -> list[Steered]:
     return [one for one in own if one.case.type != "pid_controller"]
 
 
-class Story:
+class Story(VirtualRun):
     """A robot with a joint for each way, and clients that command all of them at 0.5 s."""
 
     def __init__(self, folder: Path, ratio: int) -> None:
@@ -94,35 +92,25 @@ class Story:
             "model: {urdf: wrap.urdf}",
         ))  # fmt: skip
         (folder / "robot.yaml").write_text(text)
-        self.robot: VirtualRobot = simulated_robot(folder / "robot.yaml", duration_s=4.5)
-        plan, bus = self.robot.plan, self.robot.buses[0]
-        self.plans = {one.name: one for one in plan.loop.controllers}
-        self.preparation = Preparation({joint.name: joint for joint in plan.loop.joints}, load_plugins())
-        self.servos = {
-            servo.joint: bus.servo(servo.servo_id) for planned in plan.buses for servo in planned.servos
-        }
+        super().__init__(folder / "robot.yaml", duration_s=4.5)
         for one in ways():
             turn_by_hand(self.servos[one.joints[0]], math.pi + self.begin * ratio)
             if one.leader:
                 turn_by_hand(self.servos[one.leader], math.pi - nearest_turn(self.goal, 0.0))
-        self.ratio = ratio
-        self.watched: list[list[float]] = []
-        bus.at(500_000_000, self.command)
-        for at_ms in range(500, 4500, 20):
-            bus.at(at_ms * 1_000_000, self.watch)
-
-    def command(self) -> None:
-        numbers: Iterator[int] = itertools.count(1)
-        for one in ways():
             for kind, data in one.asks:
-                asked = json.dumps(sent_to(data, self.goal)).encode()
-                prepared = self.preparation.command(self.plans[one.top], kind, asked, units=False)
-                command = CommandMessage(next(numbers), one.top, kind, prepared.data, "anna")
-                self.robot.inbox.waiting.append(command)
+                self.command(500, one.top, kind, sent_to(data, self.goal))
+        self.ratio = ratio
+        self.sample(self.followers, 20, 500)
 
-    def watch(self) -> None:
-        angles = [self.servos[one.joints[0]].shaft.angle for one in ways()]
-        self.watched.append([(angle - math.pi) / self.ratio - self.begin for angle in angles])
+    @property
+    def followers(self) -> list[SimulatedServo]:
+        return [self.servos[one.joints[0]] for one in ways()]
+
+    @property
+    def turned(self) -> Floats:
+        """The way of each joint since the begin, rad, a row each sample."""
+        angles = np.array([self.shaft(servo) for servo in self.followers]).T
+        return (angles - math.pi) / self.ratio - self.begin
 
 
 def test_each_standard_controller_that_takes_positions_is_in_the_matrix() -> None:
@@ -141,12 +129,12 @@ def test_each_standard_controller_that_takes_positions_is_in_the_matrix() -> Non
 def test_joint_that_wraps_takes_the_shorter_way(tmp_path: Path, ratio: int) -> None:
     story = Story(tmp_path, ratio)
 
-    story.robot.run()
+    story.run()
 
-    turned = np.array(story.watched)
+    turned = story.turned
     for one, farthest, last in zip(ways(), np.abs(turned).max(axis=0), turned[-1], strict=True):
         assert farthest < MOST, f"{one.case.name}: {math.degrees(farthest):.1f} deg"
         if one in _exact():
             assert last == pytest.approx(STEP, abs=math.radians(1)), one.case.name
     exact = {one.top for one in _exact()}
-    assert [one.sentence for one in story.robot.events.goals.failed if one.controller in exact] == []
+    assert [one.sentence for one in story.events.goals.failed if one.controller in exact] == []

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tests.kit.bodies import Turned, bodies_of
+from tests.kit.virtual_run import VirtualRun, send, source_states
 
 from dxlrun.channels import slot
-from dxlrun.channels.commands import CommandMessage
 from dxlrun.channels.slot import SlotReader, SlotWriter
 from dxlrun.control.sampled_sources import SampledSource
 from dxlrun.errors import InputError, PlugInError, PortError
@@ -173,11 +173,8 @@ IMU = "{type: simulated_imu, link: tip}"
 
 
 def run(path: Path, log: Path, positions: tuple[float, float], seconds: float = 2.0) -> Log:
-    plan = plan_of(path, duration_s=seconds)
-    robot = VirtualRobot(plan, log=log)
-    robot.inbox.waiting.append(CommandMessage(0, "arm", "position", np.array(positions).tobytes(), "test"))
-    assert robot.run().detail == ""
-    return read_log(log)
+    asked = {0: [send("arm", "position", *positions)]}
+    return read_log(VirtualRun(path, log, asked, duration_s=seconds).logged())
 
 
 @pytest.mark.parametrize(
@@ -189,15 +186,6 @@ def test_rate_and_timeout_have_defaults_by_the_loop_and_by_the_rate(crane, entry
     assert (plan.period_ns, plan.timeout_ns) == (period_ms * 1_000_000, timeout_ms * 1_000_000)
 
 
-def states(log: Log) -> dict[str, np.ndarray]:
-    return {
-        name: log.cycles["source_state"][:, index]
-        for index, name in enumerate(
-            f"{source}/{state}" for source, many in log.header.sources.items() for state in many
-        )
-    }
-
-
 @pytest.mark.parametrize("physics", ["independent", "mujoco"])
 def test_at_rest_gravity_shows_how_the_link_is_turned(crane, tmp_path, physics):
     if physics == "mujoco":
@@ -205,7 +193,7 @@ def test_at_rest_gravity_shows_how_the_link_is_turned(crane, tmp_path, physics):
     turned, lifted = 0.5, 0.7
     path = crane(("model: {urdf", f"simulation: {{physics: {physics}}}\nmodel: {{urdf"))
     log = run(path, tmp_path / "run.mcap", (turned, lifted))
-    found = states(log)
+    found = source_states(log)
     position = log.cycles["position"][-1]
     assert position == pytest.approx([turned, lifted], abs=0.02)
     # the boom rises by the angle of lift; the tip's x is the boom's y, its y against the boom's x
@@ -240,7 +228,7 @@ def test_noise_has_the_density_that_was_asked_for_and_bias_stays(crane, tmp_path
         " accelerometer: {noise_density: 0.01, bias: [0 m/s^2, 0.2 m/s^2, 0 m/s^2]}}"
     )
     log = run(crane((IMU, entry)), tmp_path / "run.mcap", (0.0, 0.0), 4.0)
-    found = {name.removeprefix("imu/"): values[50:] for name, values in states(log).items()}
+    found = {name.removeprefix("imu/"): values[50:] for name, values in source_states(log).items()}
     rate, force = 2e-3 * math.sqrt(100), 0.01 * math.sqrt(100)
     means = {"angular_velocity.x": math.radians(1), "linear_acceleration.y": 0.2, "linear_acceleration.z": G}
     for name, values in found.items():
@@ -306,9 +294,7 @@ def test_a_sensor_that_stops_ends_the_run_where_it_shall_and_a_replay_too(
     filter_first = "  tilt: {type: imu_sensor_broadcaster, sensor: imu}\n  arm: {type"
     entry = f"{{type: simulated_imu, link: tip, timeout: 80 ms, on_lost: {on_lost}, {NOISY}}}"
     log = tmp_path / "run.mcap"
-    robot = VirtualRobot(
-        plan_of(crane(("  arm: {type", filter_first), (IMU, entry)), duration_s=3.0), log=log
-    )
+    robot = VirtualRun(crane(("  arm: {type", filter_first), (IMU, entry)), log, duration_s=3.0)
     change_reads(robot, monkeypatch, silent if kind == "silent" else stuck())
     result = robot.run()
     found = read_log(log)
@@ -330,21 +316,21 @@ def test_a_sensor_that_stops_ends_the_run_where_it_shall_and_a_replay_too(
             1.5 + {"silent": 0.08, "stuck": 0.2}[kind], abs=0.02 + 0.1 * (kind == "stuck")
         )
         assert not robot.failures
-    replayed = replay_log(log)
-    assert replayed.same, replayed
-    assert replayed.compared == len(found.cycles)
+    report = replay_log(log)
+    assert report.same, report
+    assert report.compared == len(found.cycles)
 
 
 def test_a_simulated_imu_without_noise_is_not_accused(crane, tmp_path):
     log = run(crane(), tmp_path / "run.mcap", (0.0, 0.0))
     assert [event.text for event in log.events if event.source == "imu"] == []
-    rates = states(log)["imu/angular_velocity.z"]
+    rates = source_states(log)["imu/angular_velocity.z"]
     assert (rates[-50:] == rates[-1]).all(), "it does bring the same sample"
 
 
 def test_a_sensor_that_never_brought_a_sample_ends_the_run_too(crane, monkeypatch):
     entry = "{type: simulated_imu, link: tip, timeout: 80 ms, on_lost: stop}"
-    robot = VirtualRobot(plan_of(crane((IMU, entry)), duration_s=1.0))
+    robot = VirtualRun(crane((IMU, entry)), duration_s=1.0)
     monkeypatch.setattr(robot.drivers["imu"], "read", lambda values: None)
     result = robot.run()
     assert (result.reason, result.cycles) == ("fault", 10)  # the one at 90 ms is the last
@@ -353,7 +339,7 @@ def test_a_sensor_that_never_brought_a_sample_ends_the_run_too(crane, monkeypatc
 
 def test_a_driver_that_raises_is_an_event_and_is_opened_again(crane, tmp_path, monkeypatch):
     log = tmp_path / "run.mcap"
-    robot = VirtualRobot(plan_of(crane(), duration_s=3.0), log=log)
+    robot = VirtualRun(crane(), log, duration_s=3.0)
     sensor, closed = robot.drivers["imu"], []
     read = sensor.read
 
@@ -376,7 +362,7 @@ def test_a_driver_that_raises_is_an_event_and_is_opened_again(crane, tmp_path, m
 
 
 def test_a_value_that_its_driver_leaves_out_is_not_that_of_the_sample_before(crane, monkeypatch):
-    robot = VirtualRobot(plan_of(crane(), duration_s=1.0))
+    robot = VirtualRun(crane(), duration_s=1.0)
     set_values = iter([slice(None)])  # all in the first sample, then the first one only
 
     def read(values: np.ndarray) -> int:

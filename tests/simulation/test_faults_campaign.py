@@ -8,20 +8,19 @@ full campaign before a release, 30 s of the robots' time each:
     pytest --campaign=release tests/simulation/test_faults_campaign.py
 """
 
-import json
 import math
 import random
 from pathlib import Path
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 from tests.kit import storms
 from tests.kit.campaigns import campaign
+from tests.kit.virtual_run import VirtualRun, ask, send
 
 from dxlrun.channels.answers import Acceptance, Answer, Code, Refusal
-from dxlrun.channels.commands import CommandMessage
 from dxlrun.log.log_reader import read_log
-from dxlrun.testing import VirtualRobot, simulated_robot
 from dxlsim.faults.kinds import KINDS
 
 pytestmark = pytest.mark.long
@@ -53,17 +52,16 @@ def draw_storm(chance: random.Random, duration_s: float) -> str:
     return f"storm seed={seed} faults={faults} within={within}ms{kinds} at={begin}ms"
 
 
-def built(name: str, directory: Path, duration_s: float) -> VirtualRobot:
+def built(name: str, directory: Path, duration_s: float) -> VirtualRun:
     """Return a robot of eight servos whose goals move: by a motion, or by a client's commands."""
     log = directory / "run.mcap"
     lines = ROBOT_OF[name]
     if lines is None:
-        return simulated_robot(TORSO[0], play=[TORSO[1]], duration_s=duration_s, log=log)
+        return VirtualRun(TORSO[0], log, play=[TORSO[1]], duration_s=duration_s)
     names = ", ".join(f"j{one}" for one in range(1, 9))
     more = f"controllers:\n  all: {{type: joint_group_position_controller, joints: [{names}]}}\n"
-    return simulated_robot(
-        storms.servos(directory, lines, limits=LIMITS, more=more), duration_s=duration_s, log=log
-    )
+    path = storms.servos(directory, lines, limits=LIMITS, more=more)
+    return VirtualRun(path, log, duration_s=duration_s)
 
 
 def ended(answer: Answer) -> bool:
@@ -71,29 +69,22 @@ def ended(answer: Answer) -> bool:
     return isinstance(answer, Refusal) and answer.code is Code.RUN_ENDING
 
 
-def commanded(robot: VirtualRobot, duration_s: float) -> dict[int, bytes]:
+def commanded(robot: VirtualRun, duration_s: float) -> dict[int, bytes]:
     """Let a client send goals to every joint ten times a second; return them by number."""
     sent: dict[int, bytes] = {}
     rows = len(robot.plan.loop.joints)
     for number in range(1, round(10 * duration_s) - 5):
-        goals = np.array([0.5 * math.sin(0.3 * number + row) for row in range(rows)])
-        command = CommandMessage(number, "all", "positions", goals.tobytes(), CLIENT)
-        sent[number] = command.data
-        at_ns = 300_000_000 + number * 100_000_000
-        robot.buses[0].at(at_ns, lambda command=command: robot.inbox.waiting.append(command))
+        command = send("all", "positions", *(0.5 * math.sin(0.3 * number + row) for row in range(rows)))
+        sent[robot.post_at(300 + number * 100, command)] = command.data
     return sent
 
 
-FIRST_REQUEST = 100_000
-"""Number of the first request for joints."""
-
-
-def requested(robot: VirtualRobot, chance: random.Random, duration_s: float) -> int:
+def requested(robot: VirtualRun, chance: random.Random, duration_s: float) -> int:
     """Let another client switch torque, reboot servos and activate what was released; return how often."""
     joints = [joint.name for joint in robot.plan.loop.joints]
     controllers = [one.name for one in robot.plan.loop.controllers if one.command]
     count = chance.choice((0, 3, round(2 * duration_s)))
-    for number in range(count):
+    for _ in range(count):
         some = chance.sample(joints, chance.choice((1, 1, 2, len(joints))))
         kind, data = chance.choice(
             (
@@ -104,9 +95,8 @@ def requested(robot: VirtualRobot, chance: random.Random, duration_s: float) -> 
                 ("switch", {"activate": [chance.choice(controllers)], "deactivate": []}),
             )
         )
-        command = CommandMessage(FIRST_REQUEST + number, "", kind, json.dumps(data).encode(), "berta")
-        at_ns = chance.randrange(300, round(duration_s * 1000)) * 1_000_000
-        robot.buses[0].at(at_ns, lambda command=command: robot.inbox.waiting.append(command))
+        ms = chance.randrange(300, round(duration_s * 1000))
+        robot.post_at(ms, replace(ask(kind, data), origin="berta"))
     return count
 
 
@@ -169,7 +159,7 @@ def test_a_reboot_at_any_byte_breaks_no_promise(number, chance, tmp_path):
     boot_ms = chance.choice((50, 60, 100, 400) if protocol == 1.0 else (1, 10, 50, 60, 100, 400))
     log_path = tmp_path / "run.mcap"
     path = storms.servos(tmp_path, {"main": (protocol, 8)})
-    robot = simulated_robot(path, duration_s=REBOOT_S, log=log_path)
+    robot = VirtualRun(path, log_path, duration_s=REBOOT_S)
     reboot = f"reboot servo={servo_id} for={boot_ms}ms at={byte * BYTE_NS // 1000}us"
     print(f"Protocol {protocol}: {reboot}")
     trial = storms.Trial.of(robot, [reboot])
@@ -183,8 +173,7 @@ def test_a_reboot_at_any_byte_breaks_no_promise(number, chance, tmp_path):
     assert others.mean() > 0.9  # those behind a silent one in a chain lose a cycle or two
     begun_ns = int(log.cycles["woken_ns"][0])
     if byte * BYTE_NS > begun_ns:
-        (servo,) = (one for one in robot.buses[0].servos if one.servo_id == servo_id)
-        assert not servo.registers["torque_enable"]
+        assert not robot.servo(servo_id).registers["torque_enable"]
         joint = f"j{servo_id}"
         sent = [event.name for event in log.events if event.source == joint and event.t_ns > begun_ns]
         assert {"servo_limp", "servo_rebooted", "servo_lost"} & set(sent), sent

@@ -17,18 +17,14 @@ from pathlib import Path
 
 import numpy as np
 from tests.kit.campaigns import campaign
+from tests.kit.virtual_run import VirtualRun, send
 from tests.kit.wire import FACTS, instructions, states, value_at, written
 
-from dxlrun.channels.commands import CommandMessage
 from dxlrun.channels.cycle import LIMP
 from dxlrun.errors import DxlrunError
 from dxlrun.log.log_reader import Log, read_log
 from dxlrun.run.virtual_run import VirtualRobot
-from dxlrun.testing import simulated_robot
-from dxlrun_analysis.replay import replay_log
-from dxlsim.faults.fault import parse_fault
 from dxlsim.faults.kinds import KINDS
-from dxlsim.faults.script import FaultScript
 from dxlwire.bus_plan import BusPlan, ServoPlan
 
 LONGEST_S = 6.0
@@ -93,17 +89,13 @@ policies: {{on_lost_servo: hold, on_returned_servo: {chance.choice(("hold", "lim
 """
 
 
-def built(chance: random.Random, directory: Path, duration_s: float, *, beyond: float = 1.0) -> VirtualRobot:
+def built(chance: random.Random, directory: Path, duration_s: float, *, beyond: float = 1.0) -> VirtualRun:
     """Return a robot to which a client sends random goals; `beyond` 1: up to its limits, else beyond them."""
-    path = directory / "drawn.yaml"
-    path.write_text(drawn(chance))
-    robot = simulated_robot(path, duration_s=duration_s, log=directory / "run.mcap")
+    robot = VirtualRun.of_text(directory, drawn(chance), duration_s)
     joints = robot.plan.loop.joints
     for number in range(1, round(duration_s * 10)):
         goals = [chance.uniform(beyond * joint.lower, beyond * joint.upper) for joint in joints]
-        command = CommandMessage(number, "all", "positions", np.array(goals).tobytes(), "anna")
-        at_ns = 250_000_000 + number * 100_000_000
-        robot.buses[0].at(at_ns, lambda command=command: robot.inbox.waiting.append(command))
+        robot.post_at(250 + number * 100, send("all", "positions", *goals))
     return robot
 
 
@@ -198,8 +190,7 @@ class Spaces:
 @campaign(ci=1, night=8, release=40)
 def test_random_motions_are_the_same_in_both_spaces_to_a_tick(number, amount, chance, tmp_path):
     robot = built(chance, tmp_path, min(LONGEST_S, 1.5 * amount))
-    assert robot.run().reason == "ended"
-    log = read_log(tmp_path / "run.mcap")
+    log = robot.finish()
     assert log.cycles["valid"].all()
     spaces = Spaces.of(robot)
     goals, positions = spaces.goals(log), spaces.positions(log)
@@ -210,8 +201,6 @@ def test_random_motions_are_the_same_in_both_spaces_to_a_tick(number, amount, ch
         joint.upper - joint.lower for joint in robot.plan.loop.joints
     ]
     assert (way > 0.05).all(), "each joint moved"
-    report = replay_log(tmp_path / "run.mcap")
-    assert report.same, report
 
 
 @campaign(ci=2, night=60, release=300)
@@ -224,7 +213,7 @@ def test_no_goal_leaves_either_space_in_a_storm(number, amount, chance, tmp_path
         f"storm seed={chance.randrange(10**6)} faults={faults} within={within}ms at={begin}ms kinds={LASTING}"
     )
     print(f"{number}: {storm}")
-    FaultScript([parse_fault(storm)]).attach(robot.buses)
+    robot.fault(storm)
     try:
         robot.run()
     except DxlrunError as error:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from tests.kit.campaigns import campaign
 from tests.kit.judged_arms import arms
-from tests.kit.stories import replayed
+from tests.kit.virtual_run import replayed
 from tests.kit.wire import values_written
 
 from dxlrun.channels.commands import LOOP, CommandMessage, QueueInbox

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 from pydantic import ValidationError
-from tests.kit.driven import DrivenRobot, changes
 from tests.kit.judged_arms import apart, example
 from tests.kit.stages import Stage
+from tests.kit.virtual_run import DrivenRobot
+from tests.kit.wire import changes
 
 from dxlrun import RemoteRobot
 from dxlrun.testing import plan_of, simulated_robot

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 from tests.kit.cases import TextCase, case_parameters
-from tests.kit.steering import read_story
+from tests.kit.steering import check_story
 
 
 @pytest.mark.parametrize("case", case_parameters(Path(__file__).parent))
 def test_each_story_comes_out_as_written(case: TextCase, tmp_path: Path) -> None:
-    read_story(case).check(tmp_path)
+    check_story(case, tmp_path)

@@ -9,8 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from tests.kit.driven import DrivenRobot, changes
 from tests.kit.judged_arms import arms
+from tests.kit.virtual_run import DrivenRobot
+from tests.kit.wire import changes
 
 from dxlrun import RemoteRobot
 from dxlrun_teleop.bank import banks_of

@@ -5,8 +5,8 @@ import shlex
 from pathlib import Path
 
 import pytest
-from tests.kit.driven import changes
 from tests.kit.pages import page_text
+from tests.kit.wire import changes
 
 from dxlrun.testing import simulated_robot
 

@@ -5,7 +5,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from tests.kit.driven import DrivenRobot, changes
+from tests.kit.virtual_run import DrivenRobot
+from tests.kit.wire import changes
 
 from dxlrun import InputError, RemoteRobot
 from dxlrun_teleop.bank import banks_of

@@ -8,8 +8,8 @@ from typing import Any, cast
 
 import pytest
 from tests.kit.awaited import until
-from tests.kit.driven import changes
 from tests.kit.hands import CODE, Screen, plain
+from tests.kit.wire import changes
 
 from dxlrun import RemoteRobot, connect, running
 from dxlrun.testing import plan_of

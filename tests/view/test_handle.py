@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.kit.awaited import until
-from tests.kit.driven import changes
 from tests.kit.judged_arms import example
 from tests.kit.torso import ROBOTS, Run
+from tests.kit.wire import changes
 from tests.view.served import Served
 from tests.view.test_in_browser import errors
 

@@ -6,8 +6,7 @@ from pathlib import Path
 import pytest
 from tests.kit.changed_logs import write_changed
 from tests.kit.packages import plugin_folder
-
-from dxlrun.testing import VirtualRobot, simulated_robot
+from tests.kit.virtual_run import VirtualRun
 
 ROBOT = """\
 name: pair
@@ -130,12 +129,11 @@ def robot_file(tmp_path_factory):
 def run(robot_file, tmp_path):
     """Run the robot for a second on virtual time, return its log; `before` sees the robot before it runs."""
 
-    def begin(before: Callable[[VirtualRobot], None], robot: Path = robot_file, seconds: float = 1.0) -> Path:
-        play, path = [robot_file.with_name("look.yaml")], tmp_path / "run.mcap"
-        one = simulated_robot(robot, play=play, duration_s=seconds, log=path)
+    def begin(before: Callable[[VirtualRun], None], robot: Path = robot_file, seconds: float = 1.0) -> Path:
+        play = [robot_file.with_name("look.yaml")]
+        one = VirtualRun(robot, tmp_path / "run.mcap", play=play, duration_s=seconds)
         before(one)
-        one.run()
-        return path
+        return one.logged()
 
     return begin
 
@@ -153,5 +151,4 @@ def pair_log(plugin, robot_file, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(plugin)
         motion = robot_file.with_name("look.yaml")
-        simulated_robot(robot_file, play=[motion], duration_s=1.0, log=path).run()
-    return path
+        return VirtualRun(robot_file, path, play=[motion], duration_s=1.0).logged()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from tests.kit.changed_logs import flip, plan
-from tests.kit.stories import Asked, ask, differing, rate, replayed, send, switch, tell, torque
+from tests.kit.virtual_run import Asked, VirtualRun, ask, differing, rate, replayed, send, switch, torque
 
 from dxlrun.channels.event_records import EventCode
 from dxlrun.errors import InputError, LogError
@@ -129,7 +129,11 @@ STORIES: Mapping[str, Asked] = {
 def story(tmp_path_factory):
     """Return the log of a story, which is run once."""
     robot = write_robot(tmp_path_factory.mktemp("chained"))
-    return cache(lambda name: tell(robot, STORIES[name], robot.with_name(f"{name}.mcap")))
+
+    def run(name: str) -> Path:
+        return VirtualRun(robot, robot.with_name(f"{name}.mcap"), STORIES[name], duration_s=1.0).logged()
+
+    return cache(run)
 
 
 def active(cycles: NDArray[np.void], row: int) -> set[str]:

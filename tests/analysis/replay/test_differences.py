@@ -5,21 +5,18 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 from msgspec import structs
 from tests.kit.changed_logs import Change, add, flip, messages, plan, put
-from tests.kit.stories import differing
+from tests.kit.virtual_run import VirtualRun, differing
 
 from dxlrun.channels.commands import CommandMessage, encode_command
 from dxlrun.channels.tagged import decode
-from dxlrun.control.controllers.plugin_loading import load_plugins
 from dxlrun.description.motion import read_motion
 from dxlrun.errors import InputError
 from dxlrun.remote.motion_requests import RunSnapshot, schedule_motion
-from dxlrun.remote.preparation import Preparation
-from dxlrun.testing import VirtualRobot, read_log, simulated_robot
+from dxlrun.testing import read_log, simulated_robot
 from dxlrun_analysis.replay import replay_log
 from dxlrun_controllers.motions.joint_trajectory_controller import JointTrajectoryController
 
@@ -216,25 +213,20 @@ def prepare_otherwise(monkeypatch: pytest.MonkeyPatch, change: Callable[[Any], A
     )
 
 
-def ask_often(robot: VirtualRobot) -> None:
+def ask_often(run: VirtualRun) -> None:
     """Hand over a command of a client every fifth cycle, and play the motion again at the end."""
-    plans = {one.name: one for one in robot.plan.loop.controllers}
-    preparation = Preparation({joint.name: joint for joint in robot.plan.loop.joints}, load_plugins())
-    waiting, record, drain = robot.inbox.waiting, robot.record, robot.inbox.drain_commands
+    for cycle in range(3, 30, 5):
+        points = [{"time": 0.1, "positions": [0.01 * cycle]}]
+        run.command(20 * cycle, "head", "trajectory", {"points": points})
+    (head,) = (one for one in run.plan.loop.controllers if one.name == "head")
+    compiled = {"head": run.door.compiled(structs.replace(head, active=True))}
+    motion = read_motion(Path(run.plan.source_file).with_name("look.yaml"))
 
-    def drain_asked() -> Any:
-        if record.cycle % 5 == 3 and record.cycle < 30:
-            body = msgspec.json.encode({"points": [{"time": 0.1, "positions": [0.01 * record.cycle]}]})
-            made = preparation.command(plans["head"], "trajectory", body)
-            waiting.append(CommandMessage(0, "head", "trajectory", made.data, "anna", request=made.request))
-        if record.cycle == 40:
-            compiled = {"head": preparation.compiled(structs.replace(plans["head"], active=True))}
-            motion = read_motion(Path(robot.plan.source_file).with_name("look.yaml"))
-            played = schedule_motion(motion, RunSnapshot(compiled, preparation.joints, record), 1.0)
-            waiting.append(CommandMessage(0, "", "play", played.data, "anna", request=played.request))
-        return drain()
+    def play() -> None:
+        played = schedule_motion(motion, RunSnapshot(compiled, run.door.joints, run.record), 1.0)
+        run.post(CommandMessage(0, "", "play", played.data, "anna", request=played.request))
 
-    robot.inbox.drain_commands = drain_asked  # type: ignore[method-assign]
+    run.at(805, play)
 
 
 def test_commands_of_clients_and_motions_are_prepared_again(run, monkeypatch):

@@ -12,8 +12,8 @@ from tests.kit.answers import result_of
 from tests.kit.changed_logs import command, edited, no_commands, put, versions
 from tests.kit.commands import cases, play
 from tests.kit.pages import page_text
-from tests.kit.stories import differing, silence
 from tests.kit.totals import totals_of
+from tests.kit.virtual_run import differing
 
 from dxlrun.compile.robot_compiler import compile_files
 from dxlrun.errors import LogError
@@ -39,7 +39,7 @@ def test_small_robot_shows_every_kind_of_value(pair_log):
 def test_silent_servo_and_periods_that_were_skipped(run, changed, robot_file, tmp_path):
     robot = tmp_path / "fast.yaml"
     robot.write_text(robot_file.read_text().replace("default: 50,", "default: 200,").replace("25}", "50}"))
-    log = run(lambda one: silence(one, (3, 7, 8), 300, 600), robot, 4.0)  # a lost one is asked once a second
+    log = run(lambda one: one.silence((3, 7, 8), 300, 600), robot, 4.0)  # a lost one is asked once a second
     cycles = read_log(log).cycles
     assert cycles["skipped"].sum() > 0
     assert not cycles["valid"].all()

@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 from msgspec import structs
 from tests.kit.changed_logs import Change, command, flip, no_commands, without
-from tests.kit.stories import Asked, ask, differing, rate, replayed, send, silence, switch, torque
-from tests.kit.stories import tell as tell_story
+from tests.kit.virtual_run import Asked, VirtualRun, ask, differing, rate, replayed, send, switch, torque
 
 from dxlrun.channels.commands import CommandMessage
 from dxlrun.channels.event_records import EventCode
 from dxlrun.errors import LogError
 from dxlrun.plan.loop_plan import ControllerPlan
-from dxlrun.testing import VirtualRobot, read_log
+from dxlrun.testing import read_log
 from dxlrun_analysis.conduct.client_commands import client_commands, policy_begun
 from dxlrun_analysis.replay import replay_log
 
@@ -86,14 +85,16 @@ def steer(robot_file, tmp_path_factory):
     def run(
         asked: Asked,
         more: str = "",
-        before: Callable[[VirtualRobot], None] = lambda robot: None,
+        before: Callable[[VirtualRun], None] = lambda run: None,
         edit: tuple[str, str] = KEEPS,
         name: str = "run",
     ) -> Path:
         text, file = robot_file.read_text() + MORE + more, directory / "steered.yaml"
         assert edit[0] in text
         file.write_text(text.replace(*edit, 1))
-        return tell_story(file, asked, directory / f"{name}.mcap", play=play, before=before)
+        one = VirtualRun(file, directory / f"{name}.mcap", asked, play=play, duration_s=1.0)
+        before(one)
+        return one.logged()
 
     return run
 
@@ -156,9 +157,9 @@ def test_a_run_that_ended_by_a_policy(steer, end):
 @pytest.mark.parametrize("overrun", ["skip", "catch_up", "stop"])
 @pytest.mark.parametrize("lost", ["hold", "[{pose: home, speed: 60 deg/s}, limp]"])
 def test_late_cycles_and_lost_servos_while_it_is_steered(steer, overrun, lost):
-    def silent(robot: VirtualRobot) -> None:
-        silence(robot, (3, 7, 8), 400, 430)
-        silence(robot, (3, 7, 8), 600, 900)
+    def silent(one: VirtualRun) -> None:
+        one.silence((3, 7, 8), 400, 430)
+        one.silence((3, 7, 8), 600, 900)
 
     policies = (
         f"{{exit_timeout: 4 s, on_lost_servo: {lost}, on_fault: [{{pose: home, speed: 60 deg/s}}, limp]}}"
@@ -262,9 +263,9 @@ def test_a_policy_of_which_the_log_has_lost_the_beginning(steer, changed):
 
 
 def test_a_bus_that_is_gone_before_the_policy(steer):
-    def pull(robot: VirtualRobot) -> None:
-        (port,) = robot.robot.hardware._lines.ports.ports  # no face of a run pulls adapters
-        robot.buses[0].at(500 * MS, port.unplug)
+    def pull(one: VirtualRun) -> None:
+        (port,) = one.robot.hardware._lines.ports.ports  # no face of a run pulls adapters
+        one.at(500, port.unplug)
 
     policies = "policies: {exit_timeout: 4 s, on_lost_servo: [{pose: home, speed: 60 deg/s}, limp]}\n"
     log = replayed(steer({5: [rate(100)]}, "poses: {home: {pan: 0 deg}}\n" + policies, pull))

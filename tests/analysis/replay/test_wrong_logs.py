@@ -8,7 +8,7 @@ import pytest
 from msgspec import structs
 from tests.kit.changed_logs import Change, add, no_commands, only, plan, plan_text, versions, without
 from tests.kit.judges import joints_of
-from tests.kit.stories import replayed
+from tests.kit.virtual_run import replayed
 
 from dxlrun.cli import main
 from dxlrun.errors import LogError, PlugInError

@@ -7,7 +7,7 @@ import itertools
 import json
 import math
 from collections import Counter, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from random import Random
@@ -17,10 +17,10 @@ import pytest
 from msgspec.structs import replace
 from tests.kit.bus_ports import BusPorts
 from tests.kit.line_faults import change_replies, watch_instructions
+from tests.kit.virtual_run import VirtualRun, ask
 
-from dxlrun.channels.commands import CommandMessage, QueueInbox
 from dxlrun.run import virtual_run
-from dxlrun.testing import Log, VirtualRobot, read_log, simulated_robot
+from dxlrun.testing import Log, read_log
 from dxlsim.bus.simulated_bus import DisturbedReply, PacketFault, SimulatedBus
 from dxlsim.faults.fault import parse_fault
 from dxlsim.faults.script import FaultScript
@@ -104,22 +104,6 @@ ROBOTS = {
 buses; 2XL by plain sync reads, as they know no fast ones."""
 
 
-class Client(QueueInbox):
-    """Sends requests to the loop, each at its time of the run."""
-
-    def __init__(self, robot: VirtualRobot, requests: Sequence[tuple[float, str, Spec]]) -> None:
-        super().__init__()
-        self._clock, self._requests = robot.clock, deque(sorted(requests, key=lambda one: one[0]))
-        self._numbers = itertools.count(1)
-
-    def drain_commands(self) -> Sequence[CommandMessage]:
-        while self._requests and self._requests[0][0] * S <= self._clock.now_ns():
-            _, kind, data = self._requests.popleft()
-            body = json.dumps(data).encode()
-            self.waiting.append(CommandMessage(next(self._numbers), "", kind, body, "a client"))
-        return super().drain_commands()
-
-
 class Story:
     """One run before it begins: what a case changes of the robot, and what it injects."""
 
@@ -136,7 +120,7 @@ class Story:
         self.motion: Spec | None = self.swing()
         self.prepared: list[Callable[[], object]] = []
         """Called once the robot is built: there are buses and servos then."""
-        self.virtual: VirtualRobot
+        self.virtual: VirtualRun
         self.numbers = itertools.count()
         """Numbers what happens, for a case that counts something"""
         self.ports_in_python = False
@@ -327,14 +311,13 @@ class Story:
             patch.setattr(virtual_run, "log_header", as_of_a_robot)
             if self.ports_in_python:
                 patch.setattr(virtual_run, "VirtualPorts", BusPorts)
-            self.virtual = simulated_robot(
-                file, play=played, duration_s=self.duration_s, log=log, arguments={"port": "sim"}
-            )
-        self.virtual.robot.loop.steering.inbox = Client(self.virtual, self.requests)
+            options: dict[str, Any] = {"play": played, "arguments": {"port": "sim"}}
+            self.virtual = VirtualRun(file, log, duration_s=self.duration_s, **options)
+        for t_s, kind, data in self.requests:
+            self.virtual.post_at(1000 * t_s, replace(ask(kind, data), origin="a client"))
         for prepare in self.prepared:
             prepare()
-        self.virtual.run()
-        read = read_log(log)
+        read = read_log(self.virtual.logged())
         for check in self.checks:
             check(read)
         return log
