@@ -27,7 +27,6 @@ from dxlsim.geometry.urdf import read_urdf
 
 ROBOTS = Path(__file__).parents[2] / "robots"
 TORSO = ROBOTS / "urdf/bioloid_torso.urdf"
-ONLY_311 = "in the extra `test` on Python 3.11 only"
 ROUNDED = 1e-6
 """Difference to the exact pose, of which the log has quaternions in steps of 2**-24."""
 STORE = get_typestore(Stores.ROS2_HUMBLE)
@@ -136,32 +135,6 @@ def test_what_does_not_move_is_logged_once_and_kept_for_who_comes_later(torso):
         assert "offered_qos_profiles" not in moved[0].channel.metadata  # an old place is worth nothing
         (profile,) = yaml.safe_load(fixed.channel.metadata["offered_qos_profiles"])
         assert (profile["durability"], profile["history"], profile["depth"]) == (1, 1, 1)
-
-
-def test_rerun_shows_a_robot_that_moves(torso):
-    """Its own reader finds the shapes of the body, and a tree of transforms that is whole and moves."""
-    chunks = pytest.importorskip("rerun.chunk", reason=ONLY_311)
-    rows: dict[tuple[str, str], list[list[float]]] = {}
-    entities = set()
-    for chunk in chunks.McapReader(torso / "whole.mcap").stream():
-        entities.add(chunk.entity_path)
-        batch = chunk.to_record_batch()
-        if chunk.entity_path in {"/tf", "/tf_static"} and "Transform3D:quaternion" in batch.schema.names:
-            columns = batch.to_pydict()
-            names = ("parent_frame", "child_frame", "quaternion")
-            for (parent,), (child,), (turn,) in zip(
-                *(columns[f"Transform3D:{name}"] for name in names), strict=True
-            ):
-                rows.setdefault((parent, child), []).append(turn)
-    assert "/bioloid_torso/visual_geometries/left_hand_link/visual_0" in entities
-    urdf = read_urdf(TORSO.read_text())
-    assert set(rows) == {(joint.parent, joint.child) for joint in urdf.joints}
-    column = np.array(rows["base_link", "neck_link"])
-    ours = open_log(torso / "whole.mcap").columns("/tf", "transforms.transform.rotation.z")
-    mine = ours["transforms.transform.rotation.z"].reshape(len(column), -1)
-    assert len(column) in {75, 76}
-    assert any(np.abs(each - column[:, 2]).max() < 1e-6 for each in mine.T)  # Rerun has float32
-    assert np.ptp(2 * np.arctan2(column[:, 2], column[:, 3])) > 0.3  # rad about z: the head
 
 
 @pytest.mark.parametrize(("rate", "counts"), [(0, {0}), (10, {4, 5}), (1000, {20})])

@@ -9,7 +9,6 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
-from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 from tests.kit.awaited import DEADLINE_S
 from tests.kit.decoded import decode_log
@@ -48,13 +47,6 @@ def run(*words: str | Path) -> subprocess.CompletedProcess[str]:
 
 def counted(path: Path) -> dict[str, int | None]:
     return {name: topic.count for name, topic in open_log(path).topics.items() if topic.count}
-
-
-def test_mcap_and_its_support_of_ros_2_decode_every_message(logs):
-    for path in logs:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
-            assert Counter(one.topic for one in decode_log(path)) == counted(path)
 
 
 def test_rosbags_opens_it_as_a_bag_and_takes_each_message_by_its_definition(logs):
@@ -97,26 +89,3 @@ def test_rerun_checks_and_converts_it_without_a_warning(logs, tmp_path):
             assert "WARN" not in text, text
             assert "ERROR" not in text, text
         assert converted.stat().st_size > 10_000
-
-
-def test_foxglove_takes_its_channels_and_messages_as_they_are(logs, tmp_path):
-    """The SDK only writes: what it writes of our schemas and messages has the same columns."""
-    foxglove = pytest.importorskip("foxglove", reason=ONLY_311)
-    path = logs[0]
-    context, channels = foxglove.Context(), {}
-    with foxglove.open_mcap(tmp_path / "foxglove.mcap", context=context), path.open("rb") as stream:
-        for schema, channel, message in make_reader(stream).iter_messages():
-            assert schema is not None
-            if channel.id not in channels:
-                channels[channel.id] = foxglove.Channel(
-                    channel.topic,
-                    schema=foxglove.Schema(name=schema.name, encoding=schema.encoding, data=schema.data),
-                    message_encoding=channel.message_encoding,
-                    metadata=channel.metadata,
-                    context=context,
-                )
-            channels[channel.id].log(message.data, log_time=message.log_time)
-    written = open_log(tmp_path / "foxglove.mcap")
-    assert {name: topic.count for name, topic in written.topics.items()} == counted(path)
-    ours = open_log(path).columns("/joint_states", "position")["position"]
-    assert written.columns("/joint_states", "position")["position"].tolist() == ours.tolist()

@@ -61,22 +61,6 @@ def waves(log, path, cycle):
     return path
 
 
-def test_mcap_ros2_decodes_every_message(waves):
-    of: dict[str, list[Any]] = {}
-    for one in decode_log(waves, "/wave/state", "/wave/odometry"):
-        of.setdefault(f"{one.topic} {one.schema.name}", []).append(one.message)
-        stamp = one.message.header.stamp
-        assert one.t_ns == stamp.sec * 10**9 + stamp.nanosec
-    states, odometry = of["/wave/state my_robotics/msg/WaveState"], of["/wave/odometry nav_msgs/msg/Odometry"]
-    assert (len(states), len(odometry)) == (51, 10)
-    assert (states[0].header.frame_id, list(states[0].error), states[0].names) == ("begin", [], [])
-    assert states[2].time_s == states[2].error[0] == pytest.approx(0.02)
-    assert np.isnan(states[2].error[1])
-    assert states[2].names == ["pan", "tilt"]
-    assert odometry[-1].pose.pose.position.x == pytest.approx(0.9)
-    assert odometry[-1].pose.covariance[35] == 0.5
-
-
 def test_our_reader_has_messages_times_columns_and_slices(waves):
     read = read_log(waves)
     states = read.messages("/wave/state")
