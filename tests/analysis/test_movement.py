@@ -165,6 +165,8 @@ def test_joint_that_swings_around_its_goal_oscillates(swing, hertz, rank):
     shakes = shaking(swing, hertz)
     joint = Joint(position=behind(SWING) + shakes)
     assert told(joint) == [("oscillates", "j0", rank)] * bool(rank)
+    lossy = np.where(np.arange(600) % 3 == 2, math.nan, joint.position)
+    assert told(Joint(position=lossy)) == []  # no swing was read as a whole
     for one in findings(joint, *WELL):
         assert "around its goal" in one.sentence
         assert "times a second" in one.sentence
