@@ -101,7 +101,8 @@ def printed_by(*words: str) -> str:
 
 def values(entry: dict[str, Any]) -> Iterator[str]:
     """Yield what a key may be, in a few words each."""
-    for one in entry.get("anyOf", ()) or entry.get("oneOf", ()):
+    branches = (one["then"] for one in entry.get("allOf", ()) if "then" in one)
+    for one in entry.get("anyOf", ()) or entry.get("oneOf", ()) or branches:
         yield from values(one)
     kind, inner = entry.get("type"), entry.get("additionalProperties")
     if "$ref" in entry and not entry["$ref"].endswith(("/argument", "/grouped")):

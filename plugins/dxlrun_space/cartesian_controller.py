@@ -45,6 +45,7 @@ from dxlrun_space.path import (
     plan_joints,
     plan_line,
     plan_positions,
+    remark_on,
 )
 from dxlrun_space.solver import Orientation, Solver, demands_orientation, distance, residual_of
 from dxlrun_space.space_goals import PoseCommand, TipGoal, TipTwist, TwistCommand, packed, unpacked
@@ -210,7 +211,10 @@ class CartesianController(Controller[CartesianParameters]):
         if parameters.leader is not None:
             fix = "send it to a cartesian_controller without `leader`"
             raise ValueError(f"the tip follows a leader, so a {kind} is not accepted; {fix}")
-        return packed(cast("PoseCommand | TwistCommand", command).prepared(parameters.joints))
+        goal = cast("PoseCommand | TwistCommand", command).prepared(parameters.joints)
+        if isinstance(goal, TipGoal) and goal.remark and parameters.orientation == "exact":
+            raise ValueError(f"the pose is {goal.remark}; name another pose, or write `orientation: nearest`")
+        return packed(goal)
 
     @classmethod
     def check_command(
@@ -561,10 +565,7 @@ class CartesianController(Controller[CartesianParameters]):
 
 def _remark(path: Path, asked: TipGoal) -> str:
     """Return what is not reached at the end of a path; empty if all is."""
-    if asked.rotation is None or path.residual.suffices(exact=True):
-        return ""
-    off = math.degrees(path.residual.orientation)
-    return f"{off:.1f} deg from the orientation, which the arm cannot reach"
+    return asked.remark if asked.rotation is None else remark_on(path.residual)
 
 
 @lru_cache(maxsize=8)

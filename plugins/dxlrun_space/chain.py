@@ -7,14 +7,24 @@ results depend on the processor, so that a replay on another computer would diff
 from __future__ import annotations
 
 import math
-from collections.abc import Container, Sequence
+from collections.abc import Sequence
 from typing import Final, TypeAlias
 
 import msgspec
 import numpy as np
 
 from dxlrun import Floats
-from dxlrun.tooling.robots import Transform, Urdf, UrdfJoint, from_rpy, product, rotated, rotation_about
+from dxlrun.tooling.files import Mistakes
+from dxlrun.tooling.robots import (
+    Transform,
+    Urdf,
+    UrdfJoint,
+    from_rpy,
+    product,
+    read_urdf,
+    rotated,
+    rotation_about,
+)
 
 Vector: TypeAlias = tuple[float, float, float]
 Quaternion: TypeAlias = tuple[float, float, float, float]
@@ -27,11 +37,11 @@ _LEAST_SINE: Final = 1e-9
 _PRIMES: Final = (2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37, 41, 43, 47, 53)
 
 
-class WrongChain(ValueError):
+class WrongChain(Mistakes):
     """The links and joints do not make a chain; `key` is the parameter that is wrong, `fix` the remedy."""
 
     def __init__(self, key: str, what: str, fix: str) -> None:
-        super().__init__(f"{what}; {fix}")
+        super().__init__([((key,) if key else (), f"{what}; {fix}")])
         self.key, self.what, self.fix = key, what, fix
 
 
@@ -118,15 +128,11 @@ class Chain:
         return columns
 
 
-def chain_of(urdf: Urdf | None, base: str, tip: str, joints: Container[str]) -> Chain:
-    """Return the chain of a robot with these joints; raise WrongChain if it has none."""
+def chain_of(urdf: str | None, base: str, tip: str) -> Chain:
+    """Return the chain in the text of a robot's URDF; raise WrongChain if it has none."""
     if urdf is None:
         raise WrongChain("tip", "the robot file names no URDF", "write `model: {urdf: NAME.urdf}`")
-    chain = Chain(urdf, base, tip)
-    if lacking := next((joint for joint in chain.joints if joint not in joints), ""):
-        what = f"{lacking} moves {tip}, but is omitted or has no servo"
-        raise WrongChain("tip", what, f"run with {lacking}, or add it to `joints`")
-    return chain
+    return Chain(read_urdf(urdf), base, tip)
 
 
 def _ways(urdf: Urdf, base: str, tip: str) -> list[UrdfJoint]:

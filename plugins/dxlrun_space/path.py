@@ -167,6 +167,13 @@ def out_of_reach(residual: Residual, exact: bool) -> str:
     return f"the pose is out of reach; the nearest is {residual.position * 1e3:.1f} mm{turn} away"
 
 
+def remark_on(residual: Residual) -> str:
+    """Return what is not reached of a pose with an orientation; empty if all is."""
+    if residual.suffices(exact=True):
+        return ""
+    return f"{math.degrees(residual.orientation):.1f} deg from the orientation, which the arm cannot reach"
+
+
 def _count(needed: float) -> int:
     return min(_MOST_NODES, max(_FEWEST_NODES, math.ceil(needed)))
 

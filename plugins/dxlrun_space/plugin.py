@@ -25,11 +25,11 @@ def dxlrun_controllers() -> Mapping[str, str]:
 
 @hookimpl
 def dxlrun_features() -> Sequence[Feature]:
-    """Return the section `tip_poses`, whose files are in this package."""
+    """Return the form of poses with the key `tip`."""
     # Imported here because most commands read no robot file.
     from dxlrun.tooling.features import Feature
 
-    return [Feature("tip_poses", "dxlrun_space")]
+    return [Feature("tip", "dxlrun_space")]
 
 
 @hookimpl

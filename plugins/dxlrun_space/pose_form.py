@@ -1,61 +1,123 @@
-"""Poses of links as positions of joints: those of `tip_poses`, and those in place of the name of a pose."""
+"""Pose of a link: its form, and the joints that have it."""
 
-from __future__ import annotations
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Annotated, Final, Self
 
-from collections.abc import Collection, Mapping
-from typing import NamedTuple
+import numpy as np
+from pydantic import AfterValidator, Field, model_validator
 
-from dxlrun.tooling.features import PoseStage
-from dxlrun.tooling.plans import JointPlan
-from dxlrun.tooling.robots import Transform, read_urdf
-from dxlrun_space.chain import BASE, Chain, WrongChain, chain_of
-from dxlrun_space.form import TipPose, rotation_of
-from dxlrun_space.path import out_of_reach
-from dxlrun_space.solver import Orientation, Solver, demands_orientation, finish_search
+from dxlrun import Angle, Floats, Length
+from dxlrun.tooling.features import LimitedJoint, PoseStage, SolvedPose
+from dxlrun.tooling.files import Form, Name, key
+from dxlrun.tooling.robots import Transform, from_rpy
 
+if TYPE_CHECKING:
+    from dxlrun_space.chain import Chain
 
-class SolvedPose(NamedTuple):
-    """Joints that have a pose."""
-
-    solver: Solver
-    positions: tuple[float, ...]
-    orientation_error: float
-    """Angle to the orientation that was asked for, rad; 0 if none was."""
+NORM: Final = 1e-3
+"""Largest difference of a quaternion's length from 1: three decimals of each number."""
 
 
-def solve_pose(
-    pose: TipPose,
-    chain: Chain,
-    joints: Mapping[str, JointPlan],
-    orientations: Collection[Orientation | None] = (),
-) -> SolvedPose:
-    """Return the joints of a chain that have a pose; raise WrongChain if there are none.
+def at_most_a_turn(value: float) -> float:
+    """Return an angle, rad; raise ValueError if it is more than a turn."""
+    if abs(value) > 2 * math.pi:
+        raise ValueError(
+            f"{value:g} rad is more than a turn; write at most a turn, with its unit, such as 90deg"
+        )
+    return value
 
-    `orientations` are the parameters `orientation` of the controllers that move the tip.
+
+def check_turns(quaternion: tuple[float, ...] | None, *others: tuple[float, ...] | None) -> None:
+    """Raise ValueError for more than one orientation, or a quaternion that is not of length 1."""
+    if sum(each is not None for each in (quaternion, *others)) > 1:
+        raise ValueError("give only one of rpy, drpy and quaternion; remove the others")
+    if quaternion is not None and abs(math.hypot(*quaternion) - 1) > NORM:
+        raise ValueError(f"the quaternion has length {math.hypot(*quaternion):.4g}; scale it to length 1")
+
+
+def rotation_of(
+    quaternion: tuple[float, float, float, float] | None, rpy: tuple[float, float, float] | None
+) -> tuple[float, float, float, float] | None:
+    """Return an orientation as a quaternion of length 1; None: none is given."""
+    if quaternion is None:
+        return None if rpy is None else from_rpy(rpy)
+    length, (x, y, z, w) = math.hypot(*quaternion), quaternion
+    return x / length, y / length, z / length, w / length
+
+
+_Place = Annotated[Length, Field(ge=-100, le=100)]  # As in the command `pose`
+_Turn = Annotated[Angle, AfterValidator(at_most_a_turn)]
+_Turns = Annotated[tuple[_Turn, _Turn, _Turn], Field(strict=False)]
+_Quaternion = Annotated[tuple[float, float, float, float], Field(strict=False)]
+
+
+class TipPose(Form):
+    """Form of a pose of a link, which becomes positions of the joints that move the link."""
+
+    tip: str = key("Link of the URDF that has the pose.", "gripper_link", min_length=1)
+    base: str = key("Link above the tip in whose axes the pose is; empty: the root.", "base_link", "")
+    x: _Place = key("Position of the tip.", "20 cm")
+    y: _Place = key("Position of the tip.", "0 cm")
+    z: _Place = key("Position of the tip.", "15 cm")
+    rpy: _Turns | None = key(
+        "Roll, pitch and yaw. Without it any orientation. With fewer than six joints the nearest one that "
+        "they reach; `dxlrun check`, and the goal of a `cartesian_controller`, report the difference.",
+        "[0 deg, 40 deg, 0 deg]",
+        None,
+    )
+    quaternion: _Quaternion | None = key("Orientation x, y, z, w in place of `rpy`.", "[0, 0, 0, 1]", None)
+    near: dict[Name, Angle] = key(
+        "Joints of the solution to prefer, where there are several.", "{elbow: 9 deg}", {}
+    )
+
+    @model_validator(mode="after")
+    def _has_one_orientation(self) -> Self:
+        check_turns(self.quaternion, self.rpy)
+        return self
+
+
+def dexterity(chain: "Chain", postures: Iterable[Sequence[float]]) -> tuple[Floats, Floats]:
+    """Return place and dexterity of the tip at joint positions: 1 in all directions alike, 0 singular.
+
+    This is the inverse condition number of the Jacobian of the tip's place (J. K. Salisbury and J. J. Craig,
+    "Articulated hands: force control and kinematic issues", 1982).
     """
+    places, columns = [], []
+    for posture in postures:
+        places.append(chain.pose(posture).translation)
+        columns.append([column[:3] for column in chain.jacobian()])
+    speeds = np.linalg.svd(np.array(columns), compute_uv=False)
+    return np.array(places), speeds[:, -1] / np.maximum(speeds[:, 0], 1e-12)
+
+
+def _solve(pose: TipPose, urdf: str | None, joints: Mapping[str, LimitedJoint]) -> SolvedPose:
+    # Imported here, because most robot files have no pose of a link.
+    from dxlrun_space.chain import BASE, WrongChain, chain_of
+    from dxlrun_space.path import out_of_reach, remark_on
+    from dxlrun_space.solver import Solver, demands_orientation, finish_search
+
+    chain = chain_of(urdf, pose.base, pose.tip)
     for joint in pose.near:
         if joint not in chain.joints:
             raise WrongChain("near", f"{joint} does not move {pose.tip}", f"write {', '.join(chain.joints)}")
-    plans = [joints[joint] for joint in chain.joints]
+    limits = [joints[joint] for joint in chain.joints]
     near = [pose.near.get(joint) for joint in chain.joints]
-    solver = Solver(chain, [plan.lower for plan in plans], [plan.upper for plan in plans], near)
+    solver = Solver(chain, [each.lower for each in limits], [each.upper for each in limits], near)
     start = tuple(each or 0.0 for each in near)
     rotation = rotation_of(pose.quaternion, pose.rpy)
-    exact = rotation is not None and any(
-        demands_orientation(each, len(plans)) for each in orientations or (None,)
-    )
+    exact = rotation is not None and demands_orientation(None, len(limits))
     target = Transform((pose.x, pose.y, pose.z), rotation or BASE.rotation)
     search = solver.search(target, start, exact=exact) if rotation else solver.search_place(target, start)
     found = finish_search(search)
     if not found.residual.suffices(exact):
         fix = "move the pose, or give it another orientation"
         raise WrongChain("", out_of_reach(found.residual, exact), fix)
-    return SolvedPose(solver, found.positions, found.residual.orientation if rotation else 0.0)
+    return SolvedPose(
+        dict(zip(chain.joints, found.positions, strict=True)),
+        remark_on(found.residual) if rotation else "",
+        {"dexterity": dexterity(chain, [found.positions])[1].item()},
+    )
 
 
-def _joints_of(pose: TipPose, urdf: str | None, joints: Mapping[str, JointPlan]) -> dict[str, float]:
-    chain = chain_of(None if urdf is None else read_urdf(urdf), pose.base, pose.tip, joints)
-    return dict(zip(chain.joints, solve_pose(pose, chain, joints).positions, strict=True))
-
-
-STAGE = PoseStage("tip", TipPose, _joints_of)
+STAGE = PoseStage("tip", TipPose, _solve)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -11,9 +10,9 @@ import numpy as np
 
 from dxlrun import Floats, InputError
 from dxlrun.tooling.output import check_target, show_parts, write_target
-from dxlrun.tooling.robots import read_urdf
 from dxlrun.tooling.verbs import Assignment, RobotPath, compiled, missing_extra
-from dxlrun_space.chain import Chain, WrongChain, chain_of, spread
+from dxlrun_space.chain import WrongChain, chain_of, spread
+from dxlrun_space.pose_form import dexterity
 
 POSTURES: Final = 20_000
 
@@ -38,10 +37,12 @@ def draw_reach(robot: RobotPath, tip: str, picture: Path, /, *assignments: Assig
     plan = compiled(robot, assignments, (), None).plan
     limits = {joint.name: (joint.lower, joint.upper) for joint in plan.loop.joints}
     try:
-        chain = chain_of(None if plan.urdf is None else read_urdf(plan.urdf), base, tip, limits)
+        chain = chain_of(plan.urdf, base, tip)
+        lower, upper = zip(*(limits[joint] for joint in chain.joints), strict=True)
     except WrongChain as wrong:
         raise InputError(str(wrong)) from None
-    lower, upper = zip(*(limits[joint] for joint in chain.joints), strict=True)
+    except KeyError as error:
+        raise InputError(f"{error.args[0]} moves {tip}, but has no servo; add it to `joints`") from None
     places, found = dexterity(chain, spread(lower, upper, POSTURES).tolist())
     places *= 1e3
     write_target(picture, _drawn(places, found, f"{tip} of {plan.robot}", picture.suffix[1:]))
@@ -50,20 +51,6 @@ def draw_reach(robot: RobotPath, tip: str, picture: Path, /, *assignments: Assig
         f"{tip}: {', '.join(f'{axis} {low:.0f}..{high:.0f} mm' for axis, low, high in ends)}; {picture}"
     )
     return 0
-
-
-def dexterity(chain: Chain, postures: Iterable[Sequence[float]]) -> tuple[Floats, Floats]:
-    """Return place and dexterity of the tip at joint positions: 1 in all directions alike, 0 singular.
-
-    This is the inverse condition number of the Jacobian of the tip's place (J. K. Salisbury and J. J. Craig,
-    "Articulated hands: force control and kinematic issues", 1982).
-    """
-    places, columns = [], []
-    for posture in postures:
-        places.append(chain.pose(posture).translation)
-        columns.append([column[:3] for column in chain.jacobian()])
-    speeds = np.linalg.svd(np.array(columns), compute_uv=False)
-    return np.array(places), speeds[:, -1] / np.maximum(speeds[:, 0], 1e-12)
 
 
 def _drawn(places: Floats, colours: Floats, title: str, form: str) -> bytes:

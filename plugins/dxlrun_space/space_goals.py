@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Annotated, Literal, Self, TypeVar
 
 import msgspec
 import numpy as np
 from pydantic import BeforeValidator, Field, TypeAdapter, model_validator
 
-from dxlrun import NAMED_POSE, Angle, AngularVelocity, CommandModel, Floats, Length, LinearVelocity
+from dxlrun import Angle, AngularVelocity, CommandModel, Floats, GoalPose, Length, LinearVelocity
 from dxlrun.tooling.robots import Transform, product
 from dxlrun_space.chain import Quaternion, Vector
-from dxlrun_space.form import at_most_a_turn, check_turns, rotation_of
+from dxlrun_space.pose_form import at_most_a_turn, check_turns, rotation_of
 
 S = TypeVar("S", bound=msgspec.Struct)
 
@@ -33,6 +33,8 @@ class TipGoal(msgspec.Struct, frozen=True, array_like=True):
     """Duration, s; None: the shortest."""
     positions: tuple[float, ...]
     """Positions of the joints, rad or m, in place of all above; empty: not given."""
+    remark: str
+    """Part of the pose that these positions do not reach; empty: none."""
 
     def target(self, frame: Transform, tip: Transform) -> Transform:
         """Return the goal pose in the base from the poses of the frame and of the tip at the start."""
@@ -85,7 +87,7 @@ _Frame = Annotated[str, Field(max_length=200)]
 class PoseCommand(CommandModel):
     """Goal pose of the tip. A coordinate that is not given keeps its value at the start"""
 
-    pose: Annotated[Mapping[str, float], NAMED_POSE] | None = None
+    pose: GoalPose | None = None
     """Name of a pose of the robot file, in place of the coordinates; all joints turn evenly to it"""
     x: _Metres | None = None
     """Goal position in the frame, m"""
@@ -127,7 +129,7 @@ class PoseCommand(CommandModel):
 
     def prepared(self, joints: Sequence[str]) -> TipGoal:
         """Return the goal of an arm with these joints; raise ValueError if the named pose lacks one."""
-        named = self.pose
+        named = None if self.pose is None else self.pose.positions
         if named is not None and (lacking := [joint for joint in joints if joint not in named]):
             raise ValueError(f"the pose has no position of {', '.join(lacking)}; name a pose of this arm")
         return TipGoal(
@@ -139,6 +141,7 @@ class PoseCommand(CommandModel):
             path=self.path,
             seconds=self.seconds,
             positions=() if named is None else tuple(named[joint] for joint in joints),
+            remark="" if self.pose is None else self.pose.remark,
         )
 
 

@@ -23,6 +23,7 @@ from dxlrun.contract.hookspecs import hookimpl as hookimpl
 from dxlrun.contract.joint_controller import JointController as JointController
 from dxlrun.contract.joint_controller import reading as reading
 from dxlrun.contract.named_pose import NAMED_POSE as NAMED_POSE
+from dxlrun.contract.named_pose import GoalPose as GoalPose
 from dxlrun.contract.polynomial import Polynomial as Polynomial
 from dxlrun.contract.serial_line import open_serial as open_serial
 from dxlrun.description.base_form import Mistake as Mistake

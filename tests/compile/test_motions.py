@@ -9,6 +9,7 @@ from tests.kit.robots import PAIR, compile_text, problems_in
 
 from dxlrun.compile.joints.poses import Poses, WrongPose
 from dxlrun.compile.motion_samples import LONGEST_FORMULA, Expression
+from dxlrun.features.feature import SolvedPose
 from dxlrun_controllers.laws.spline import SplineSample, Trajectory
 
 GROUP = "    type: joint_group_posvel_controller\n"
@@ -116,5 +117,5 @@ def test_where_a_formula_has_no_value_it_says_why(text: str, says: str):
 
 def test_a_pose_without_positions_has_its_problem_as_data():
     with pytest.raises(WrongPose) as wrong:
-        Poses({"up": {"a": 0.1}}).find_positions("up;\ndown; now")
-    assert wrong.value.problems == (("the robot has no pose up;\ndown; now", "known: up"),)
+        Poses({"up": SolvedPose({"a": 0.1})}).find_pose("up;\ndown; now")
+    assert wrong.value.problems == (((), "the robot has no pose up;\ndown; now", "known: up"),)

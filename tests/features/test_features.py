@@ -27,7 +27,7 @@ from dxlrun.description.joints.joint_forms import BareJoint, Joint, SharedJoint
 from dxlrun.description.joints.joint_mechanics import OneOfServos
 from dxlrun.description.robot import Group, GroupPolicies, Policies, Robot, robot_form
 from dxlrun.errors import InputError
-from dxlrun.features import FEATURES, RESERVED, installed_features, stages
+from dxlrun.features import FEATURES, RESERVED, stages
 from dxlrun.features.feature import Feature, JointKey, PolicyKey, Section, ServoKey
 from dxlrun.features.sensors.compile import is_units
 from dxlrun.features.sensors.plan import decode_sensors
@@ -46,9 +46,7 @@ ROBOT = ROOT / "robots" / "bioloid_torso.yaml"
 def test_each_feature_has_the_section_of_its_name():
     sections = {feature.name: section for feature, section in stages(Section, FEATURES)}
     assert {name: section.name for name, section in sections.items()} == {name: name for name in sections}
-    of_plugins = {section.name for _, section in stages(Section, installed_features())} - sections.keys()
-    assert of_plugins == {"tip_poses"}
-    assert robot_form().model_fields.keys() - Robot.model_fields.keys() == sections.keys() | of_plugins
+    assert robot_form().model_fields.keys() - Robot.model_fields.keys() == sections.keys()
 
 
 def test_all_files_of_features_are_on_the_page_of_the_architecture():
@@ -200,7 +198,7 @@ def test_key_of_plugin_with_name_of_the_core_is_refused(offer, name, file):
     ("name", "files", "declared", "said"),
     [
         ("_lamps", ["joint_key"], "", "does not begin with a letter"),
-        ("lamps", ["joint_key"], "bus", "joint_key.py, servo_key.py or policy_key.py declares it"),
+        ("lamps", ["joint_key"], "bus", "servo_key.py, policy_key.py or pose_form.py declares it"),
         ("glow", ["joint_key", "servo_key"], "", "both for joints and for servos"),
     ],
 )
@@ -224,9 +222,9 @@ def test_all_names_of_the_core_are_reserved():
         PolicyKey: (Policies, GroupPolicies),
     }
     features = {feature.name for feature in FEATURES}
-    for kind, names in RESERVED.items():
-        public = {name for form in forms[kind] for name in {*dir(form), *form.model_fields} if name[0] != "_"}
-        assert public - {*dir(Form)} - features <= {*names.split()}, kind
+    for kind, own in forms.items():
+        public = {name for form in own for name in {*dir(form), *form.model_fields} if name[0] != "_"}
+        assert public - {*dir(Form)} - features <= {*RESERVED[kind].split()}, kind
     assert {*Robot.read_before} <= {*RESERVED[Section].split()}
     report = to_builtins(compile_files(ROBOT, {}, []).report)
     assert all(report.keys() - features <= {*names.split()} for names in RESERVED.values())

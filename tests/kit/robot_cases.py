@@ -42,6 +42,7 @@ from dxlwire.exceptions import HELP
 
 ROOTS: Mapping[str, Callable[[CompiledRobot], object]] = {
     "robot": lambda robot: read_robot(Path("robot.yaml"), robot.plan.arguments).robot,
+    "poses": lambda robot: robot.plan.poses,
     "plan": lambda robot: robot.plan,
     "loop": lambda robot: robot.plan.loop,
     "joints": lambda robot: robot.plan.loop.joints,

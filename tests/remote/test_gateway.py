@@ -506,7 +506,7 @@ def test_a_plug_in_that_never_returns_is_interrupted_and_the_next_client_is_serv
 
 def test_poses_that_take_long_are_interrupted(monkeypatch):
     monkeypatch.setattr(preparation, "BUDGET_S", 0.05)
-    monkeypatch.setattr(Poses, "find_positions", lambda *_: time.sleep(DEADLINE_S))
+    monkeypatch.setattr(Poses, "find_pose", lambda *_: time.sleep(DEADLINE_S))
     motions = {"a": {"steps": [{"time": "1 s", "pose": "rest"}]}}
     entry = {"name": "more", "type": "keyframe_player", "joints": ["pan"], "motions": motions}
     status, content = Desk(offered=load_plugins()).ask("POST", "/controllers", entry)

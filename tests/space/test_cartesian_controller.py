@@ -138,6 +138,10 @@ def test_a_named_pose_is_reached_by_its_own_joints(name: str, keys: dict[str, An
     assert stage.goal.ended[0][:2] == ("aborted", f"the pose has {arm.joints[1]} outside its limits")
     with pytest.raises(ValueError, match="the pose has no position of "):
         stage.prepare("pose", pose={arm.joints[2]: 0.1})
+    with pytest.raises(
+        ValueError, match="the pose is far off; name another pose, or write `orientation: near"
+    ):
+        staged(name, orientation="exact").prepare("pose", pose={"positions": named, "remark": "far off"})
 
 
 def test_a_duration_is_kept() -> None:

@@ -72,7 +72,7 @@ class Step(ParametersModel):
     time: Annotated[Duration, Field(ge=10_000_000)]
     """Time of the way to the pose."""
     pose: Annotated[dict[str, Angle], NAMED_POSE]
-    """Positions by joint, rad, the name of a pose of the robot file, or a pose of a link as in `tip_poses`. A
+    """Positions by joint, rad, the name of a pose of the robot file, or a pose of a link as in `poses`. A
     joint that is not named keeps its last goal."""
     pause: Duration = 0
     """Time at the pose."""

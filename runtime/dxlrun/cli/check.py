@@ -176,6 +176,7 @@ def _tables(result: CompiledRobot) -> Iterator[Table]:
         yield _servos({(servo["bus"], servo["id"]): servo for servo in servos}.values())
     groups = ((name, ", ".join(joints)) for name, joints in report["groups"].items())
     yield Table.from_rows("Groups", (Column("group", "name"), Column("joints", "text")), groups)
+    yield _poses(report["poses"])
     for feature, stage in stages(TableStage, result.plan.features):
         yield stage.table(report[feature.name])
     yield _controllers(report["controllers"], len(joints))
@@ -202,6 +203,24 @@ _MOTIONS: Columns[Row] = [
     (Column("end", form="{:g} s"), "end"),
     *_named("number", points="points", commands="commands"),
 ]
+
+
+def _poses(poses: Sequence[Row]) -> Table:
+    def margin(row: Row) -> str | None:
+        left, unit = row["margin"], LINEAR if row["linear"] else ROTARY
+        return None if left is None else f"{unit.text(left)} of {row['margin_joint']}"
+
+    def figure(name: str) -> tuple[Column, Callable[[Row], float | None]]:
+        return Column(name, form="{:.2f}"), lambda row: row["figures"].get(name)
+
+    figures = dict.fromkeys(name for row in poses for name in row["figures"])
+    columns: Columns[Row] = [
+        *_named("name", pose="name"),
+        *map(figure, figures),
+        (Column("left to a limit", "name"), margin),
+        *_named("text", **{"not reached": "remark"}),
+    ]
+    return Table.listing("Poses", columns, poses)
 
 
 def _joints(joints: Sequence[Row]) -> Table:

@@ -18,7 +18,7 @@ from dxlrun.compile.joints.described_servos import DescribedServo
 from dxlrun.description.joints.joint_forms import joint_keys, units_of_key
 from dxlrun.description.joints.joint_mechanics import Limits
 from dxlrun.features import stages
-from dxlrun.features.feature import JointKey
+from dxlrun.features.feature import JointKey, SolvedPose
 from dxlrun.output.text_table import Table
 from dxlrun.plan.loop_plan import JOINT_PROPERTIES, ControllerPlan, JointPlan, JointProperty, LoopPlan
 from dxlrun.plan.robot_plan import MotionPart, Plan
@@ -57,6 +57,7 @@ def check_report(
         "joints": [_joint(joint, servos) for joint in joints],
         "groups": plan.groups,
         "omitted": plan.omitted,
+        "poses": [_pose(name, pose, loop) for name, pose in plan.poses.items() if pose.positions],
         **{feature.name: [*stage.rows(plan)] for feature, stage in stages(TableStage, plan.features)},
         "controllers": [_controller(controller, rate) for controller in loop.controllers],
         "buses": [_bus(bus, rate) for bus in buses],
@@ -151,6 +152,21 @@ def _servo(servo: CompiledServo, plan: ServoPlan) -> Row:
 
 def _described(servo: DescribedServo) -> Row:
     return {name: getattr(servo, name) for name in ("bus", "id", "model", "reference", "direction", "motor")}
+
+
+def _pose(name: str, pose: SolvedPose, loop: LoopPlan) -> Row:
+    joints = {joint.name: joint for joint in loop.joints}
+    own = [(joints[joint], at) for joint, at in pose.positions.items()]
+    margin, nearest = min(
+        ((min(at - joint.lower, joint.upper - at), joint) for joint, at in own), key=lambda pair: pair[0]
+    )
+    return {
+        "name": name,
+        **msgspec.structs.asdict(pose),
+        "margin": None if math.isinf(margin) else margin,
+        "margin_joint": nearest.name,
+        "linear": nearest.unit is LINEAR,
+    }
 
 
 def _controller(plan: ControllerPlan, rate: float) -> Row:

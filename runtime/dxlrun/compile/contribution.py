@@ -68,9 +68,6 @@ class Contribution(msgspec.Struct, frozen=True):
     """Assignment of servos to joints, if some joints have several servos; only one feature may set it."""
     recording: RecordingPlan | None = None
     """Folder and settings of the log; only one feature may set it."""
-    poses: Mapping[str, Mapping[str, float] | None] = {}
-    """Positions of joints, rad or m, by the names by which policies, motions and keyframes use them; empty: a
-    joint of the pose is omitted; None: the pose has a mistake, which is reported."""
     policies: Mapping[str, str] = {}
     """Texts for `dxlrun check` that say what the feature's policies do, by `policy` or `policy of group`."""
 

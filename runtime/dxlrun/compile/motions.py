@@ -96,7 +96,7 @@ def compile_motions(
         if isinstance(found, MotionDescription):
             played.append(found)
             try:
-                found = with_poses(found, poses)
+                found = with_poses(found, poses, file)
             except InputError as error:
                 file.extend(error.problems)
                 continue
@@ -106,8 +106,11 @@ def compile_motions(
     return played, parts
 
 
-def with_poses(motion: MotionDescription, poses: Poses) -> MotionDescription:
-    """Return a motion whose points have the joints of the poses that they name; raise InputError."""
+def with_poses(motion: MotionDescription, poses: Poses, remarks: Problems) -> MotionDescription:
+    """Return a motion whose points have the joints of the poses that they name; raise InputError.
+
+    `remarks` gets a warning for each pose that the joints do not reach in full.
+    """
     problems, wrong_poses = Problems(), list[WrongPose]()
 
     def posed(point: Point, number: int, index: int) -> Point:
@@ -115,20 +118,25 @@ def with_poses(motion: MotionDescription, poses: Poses) -> MotionDescription:
             return point
         path = ("motions", index, "points", number, "pose")
         try:
-            positions = poses.find_positions(point.pose)
+            solved = poses.find_pose(point.pose)
             found = (
                 _BY_JOINT.validate_python(point.pose)
-                if positions is None
-                else {joint: Measure(at, poses.joints[joint].unit.si) for joint, at in positions.items()}
+                if solved is None
+                else {
+                    joint: Measure(at, poses.joints[joint].unit.si) for joint, at in solved.positions.items()
+                }
             )
         except WrongPose as wrong:
             wrong_poses.append(wrong)
-            for problem in wrong.problems:
-                problems.error(motion.marks.value(*path), *problem)
+            for inside, *problem in wrong.problems:
+                problems.error(motion.marks.value(*path, *inside), *problem)
             return point
         except ValidationError as error:
             problems.extend(problems_of(error, motion.marks, path))
             return point
+        if solved is not None and solved.remark:
+            fix = "give it another orientation"
+            remarks.warning(motion.marks.value(*path), f"the pose is {solved.remark}", fix)
         targets = {joint: Target(position=at) for joint, at in found.items()}
         return point.model_copy(update={"joints": targets | point.joints})
 

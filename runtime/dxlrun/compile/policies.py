@@ -5,15 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 
-from dxlrun.compile.contribution import Contribution
+from msgspec.structs import replace
+
 from dxlrun.compile.joints.compiled_joints import CompiledJoint
 from dxlrun.compile.joints.limits import Interval, degrees, limits_of
 from dxlrun.compile.joints.poses import Poses, WrongPose
 from dxlrun.compile.problems import RobotFile
 from dxlrun.description.document import KeyPath
 from dxlrun.description.robot import PoseStep, TorqueStep, WrittenPolicy
+from dxlrun.description.units import Measure
 from dxlrun.errors import suggestion
-from dxlrun.features.feature import PolicyKey
+from dxlrun.features.feature import PolicyKey, SolvedPose
 from dxlrun.plan.policy_plan import (
     HOLD,
     LIMP,
@@ -33,27 +35,33 @@ MARGIN_NS = 100_000_000
 _EXAMPLES: Mapping[JointUnit, str] = {ROTARY: "60 deg", LINEAR: "20 mm"}
 
 
-def compile_poses(
-    file: RobotFile,
-    joints: Mapping[str, CompiledJoint],
-    urdf: str | None,
-    contributions: Mapping[str, Contribution],
-) -> Poses:
-    """Return all poses: those of the section `poses`, checked, and those of features, by section."""
-    _check_poses(file, joints)
-    poses: dict[str, Mapping[str, float]] = {name: {} for name in file.description.omitted_poses}
-    poses |= file.robot.poses
-    mistaken = set[str]()
-    for section, contribution in contributions.items():
-        for name, positions in contribution.poses.items():
-            if name in poses:
-                file.error(file.key(section, name), f"{name} is already the name of a pose", "rename one")
-            poses[name] = positions or {}
-            if positions is None:
-                mistaken.add(name)
+def compile_poses(file: RobotFile, joints: Mapping[str, CompiledJoint], urdf: str | None) -> Poses:
+    """Return all poses, checked, and solved if they are in the form of a feature."""
     plans = {name: joint.plan for name, joint in joints.items()}
     wrong = len(plans) < len(file.robot.joints) or (urdf is None and file.robot.model is not None)
-    return Poses(poses, plans, file.description.omitted, urdf, wrong, mistaken)
+    poses = Poses({}, plans, file.description.omitted, urdf, wrong)
+    named = dict.fromkeys(file.description.omitted_poses, SolvedPose({}))
+    mistaken = set[str]()
+    for name, written in file.robot.poses.items():
+        if isinstance(written, dict):
+            _check_pose(file, name, written, joints)
+            named[name] = SolvedPose({joint: float(at) for joint, at in written.items()})
+            continue
+        named[name] = SolvedPose({})
+        try:
+            named[name] = poses.solve_pose(written)
+        except WrongPose as error:
+            if error.lacking in poses.omitted:
+                what, fix = (
+                    f"pose {name} is omitted, because it needs {error.lacking}",
+                    f"run with {error.lacking}",
+                )
+                file.warning(file.key("poses", name), what, fix)
+                continue
+            mistaken.add(name)
+            for path, what, fix in error.problems:
+                file.error(file.at("poses", name, *path), f"{name}: {what}", fix)
+    return replace(poses, named=named, mistaken=mistaken)
 
 
 def compile_policies(
@@ -81,24 +89,25 @@ def compile_policies(
     return PolicyPlan(found.pop("on_exit"), found.pop("on_fault"), max(0, limit_ns), of_features=found)
 
 
-def _check_poses(file: RobotFile, joints: Mapping[str, CompiledJoint]) -> None:
+def _check_pose(
+    file: RobotFile, pose: str, positions: Mapping[str, Measure], joints: Mapping[str, CompiledJoint]
+) -> None:
     known = tuple(file.robot.joints)
-    for pose, positions in file.robot.poses.items():
-        for joint, position in positions.items():
-            if joint not in known:
-                mark = file.key("poses", pose, joint)
-                what = f"joint {joint} of pose {pose} is not defined"
-                file.error(mark, what, suggestion(joint, known))
-            elif joint in joints:
-                plan = joints[joint].plan
-                allowed, mark = limits_of(plan), file.at("poses", pose, joint)
-                if plan.unit is not position.joint_unit:
-                    what = f"{joint} {plan.unit.verb}, so pose {pose} cannot have it in {position.unit}"
-                    file.error(mark, what, f"write it as {_EXAMPLES[plan.unit]}")
-                elif not allowed.contains(Interval(position, position)):
-                    at = plan.unit.text(position, trim=True)
-                    what = f"pose {pose} puts {joint} at {at}, outside its limits {allowed}"
-                    file.error(mark, what, "change the pose or the limits")
+    for joint, position in positions.items():
+        if joint not in known:
+            mark = file.key("poses", pose, joint)
+            what = f"joint {joint} of pose {pose} is not defined"
+            file.error(mark, what, suggestion(joint, known))
+        elif joint in joints:
+            plan = joints[joint].plan
+            allowed, mark = limits_of(plan), file.at("poses", pose, joint)
+            if plan.unit is not position.joint_unit:
+                what = f"{joint} {plan.unit.verb}, so pose {pose} cannot have it in {position.unit}"
+                file.error(mark, what, f"write it as {_EXAMPLES[plan.unit]}")
+            elif not allowed.contains(Interval(position, position)):
+                at = plan.unit.text(position, trim=True)
+                what = f"pose {pose} puts {joint} at {at}, outside its limits {allowed}"
+                file.error(mark, what, "change the pose or the limits")
 
 
 def _policy(
@@ -121,9 +130,9 @@ def _policy(
         elif isinstance(step, PoseStep):
             mark_path = ("policies", name, index, "pose")
             try:
-                angles = poses.find_named(step.pose)
+                angles = poses.find_named(step.pose).positions
             except WrongPose as wrong:
-                for problem in wrong.problems:
+                for _, *problem in wrong.problems:
                     file.error(file.at(*mark_path), *problem)
             else:
                 linear = [joint for joint in angles if joint in joints and joints[joint].plan.unit is LINEAR]

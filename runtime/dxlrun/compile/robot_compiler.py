@@ -185,7 +185,7 @@ def compile_robot(
     sources = tuple(source for each in contributions for source in each.sources)
     devices = (device for each in contributions for device in each.devices)
     simulation = compile_simulation(file, joints, devices, motors)
-    poses = compile_poses(file, joints, urdf, by_feature)
+    poses = compile_poses(file, joints, urdf)
     controllers = compile_controllers(file, plugins, contributions, poses)
     providers = {one.name: one.states for one in sources} | {
         name: one.plan.provides for name, one in controllers.items() if one.plan.provides
@@ -255,7 +255,7 @@ def compile_robot(
         frames=frames,
         simulation=simulation,
         groups=description.groups,
-        poses={name: {joint: float(at) for joint, at in pose.items()} for name, pose in poses.named.items()},
+        poses=dict(poses.named),
         omitted=description.omitted,
         gateway=robot.processes.gateway.enabled,
         packages=plugins.packages_of(loop.controllers, _models(buses))

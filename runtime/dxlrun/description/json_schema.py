@@ -12,7 +12,7 @@ from __future__ import annotations
 import ast
 import inspect
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from functools import cache
 from itertools import pairwise
@@ -30,7 +30,7 @@ from dxlrun.description.joints.groups import DEFAULTS, GROUPS
 from dxlrun.description.joints.joint_forms import joint_conditions
 from dxlrun.description.joints.motor_file import MotorForm
 from dxlrun.description.motion import MotionForm
-from dxlrun.description.robot import robot_form
+from dxlrun.description.robot import pose_stages, robot_form
 
 Schema = dict[str, Any]  # A JSON Schema. Its values can be any JSON, so no type narrower than Any is correct.
 
@@ -104,7 +104,12 @@ def _robot(controllers: Models, entries: Entries) -> Schema:
     top = shaped.node(schema)
     own = top["properties"]
     top.pop("description")
-    own["joints"]["additionalProperties"] = _any_joint(own["joints"]["additionalProperties"])
+    own["joints"]["additionalProperties"] = _selected(
+        joint_conditions(), own["joints"]["additionalProperties"]
+    )
+    if forms := [(one.form.__name__, {"required": [one.name]}) for one in pose_stages()]:
+        poses = own["poses"]
+        poses["additionalProperties"] = _selected(forms, poses["additionalProperties"]["oneOf"][0])
     shared = _shared({form: definitions[form]["properties"] for form, _ in joint_conditions()})
     defaults = {"type": "object", "additionalProperties": False, "properties": shared}
     defaults["description"] = "Default keys of all joints; keys of a joint or its groups have priority."
@@ -194,11 +199,16 @@ def _any_entry(entry: Schema, kinds: list[str], room: str) -> Schema:
     return {**shown, "properties": {**entry["properties"], "type": written}, "allOf": branches}
 
 
-def _any_joint(any_form: Schema) -> Schema:
-    """Return the JSON Schema of a joint, in which its keys select one of the forms of joints."""
+def _selected(conditions: Iterable[tuple[str, Schema]], any_form: Schema) -> Schema:
+    """Return the JSON Schema of an entry of a section, in which its keys select one of its forms.
+
+    Args:
+        conditions: Name of each form with the JSON Schema condition that selects it.
+        any_form: JSON Schema of an entry for which no condition holds.
+    """
     branches: list[Schema] = []
     before: list[Schema] = []
-    for form, told_by in joint_conditions():
+    for form, told_by in conditions:
         branches.append({"if": _and_none_of(told_by, before), "then": {"$ref": f"#/$defs/{form}"}})
         before.append(told_by)
     branches.append({"if": {"not": {"anyOf": before}}, "then": any_form})

@@ -81,7 +81,7 @@ class Point(Form):
     joints: dict[Name, Target] = key("Targets by joint.", "{head_joint: {position: 30 deg}}", {})
     pose: WrittenPose | None = key(
         "Pose for the joints that `joints` does not name: a name of the robot file, positions by joint, or a "
-        "pose of a link as in `tip_poses`.",
+        "pose of a link as in `poses`.",
         "rest",
         None,
     )

@@ -1,8 +1,9 @@
 """Robot: the form of a robot file, apart from the sections that features add."""
 
 from collections.abc import Mapping
-from functools import cache
-from typing import Annotated, ClassVar, Literal, get_args
+from functools import cache, reduce
+from operator import or_
+from typing import Annotated, Any, ClassVar, Literal, get_args
 
 from pydantic import (
     AfterValidator,
@@ -17,6 +18,7 @@ from dxlrun.description import units
 from dxlrun.description.base_form import Form, Name, PlugInEntry, key, validation_error, with_keys
 from dxlrun.description.bus import Bus
 from dxlrun.description.joints.joint_forms import JointEntry, joint_form
+from dxlrun.description.mistakes.words import words_for
 from dxlrun.description.units import (
     AngularVelocity,
     AutoDuration,
@@ -29,7 +31,8 @@ from dxlrun.description.units import (
 )
 from dxlrun.errors import suggestion
 from dxlrun.features import installed_features, stages
-from dxlrun.features.feature import PolicyKey, Section
+from dxlrun.features.feature import PolicyKey, PoseStage, Section
+from dxlsim.texts.duration import split_quantity
 
 
 def _cores(value: tuple[int, ...]) -> tuple[int, ...]:
@@ -333,8 +336,9 @@ class Robot(Form):
     controllers: dict[Name, ControllerEntry] = key(
         "Controllers by name, in the order of their updates.", "{head: {type: ...}}", {}
     )
-    poses: dict[Name, Annotated[dict[Name, Position], Field(min_length=1)]] = key(
-        "Poses by name, with positions of some or all joints, for policies, motions and keyframes.",
+    poses: dict[Name, dict[Name, Position] | Form] = key(
+        "Poses by name, for policies, motions, keyframes and clients: positions of some or all joints, or "
+        "the form of a feature.",
         "{home: {head_joint: 0 deg}}",
         {},
     )
@@ -348,6 +352,34 @@ class Robot(Form):
     )
 
 
+def pose_stages() -> list[PoseStage[Any]]:
+    """Return the forms of poses of installed features."""
+    return [stage for _, stage in stages(PoseStage, installed_features())]
+
+
+def pose_form() -> object:
+    """Return the pydantic type of a pose: positions by joint, or the form of a feature.
+
+    A pose in the form of a feature has the feature's key, or a foreign term for it, with a text that is not a
+    quantity.
+    """
+    forms = pose_stages()
+    tags = {
+        word: f"<{one.name}>"
+        for one in forms
+        for word in (one.name, *words_for(one.form.__name__, [one.name]))
+    }
+
+    def kind_of_pose(pose: object) -> str:
+        values = pose.items() if isinstance(pose, dict) else ()
+        texts = (key for key, at in values if isinstance(at, str) and split_quantity(at) is None)
+        return next((tags[key] for key in texts if key in tags), "<joints>")
+
+    by_joint = Annotated[dict[Name, Position], Field(min_length=1), Tag("<joints>")]
+    others = (Annotated[one.form, Tag(f"<{one.name}>")] for one in forms)
+    return Annotated[reduce(or_, others, by_joint), Discriminator(kind_of_pose)] if forms else by_joint
+
+
 @cache
 def robot_form() -> type[Robot]:
     """Return the form of a robot file, extended by the sections and keys of installed features."""
@@ -357,4 +389,5 @@ def robot_form() -> type[Robot]:
         Robot,
         [Section("policies", policies, key(*_POLICIES, policies.of_defaults())), *sections],
         joints=dict[Name, joint_form()],  # type: ignore[misc]  # made at run time
+        poses=dict[Name, pose_form()],  # type: ignore[misc]  # as above
     )

@@ -13,7 +13,7 @@ from typing import Any, cast
 
 from msgspec.structs import replace
 
-from dxlrun.features.feature import Feature, JointKey, PolicyKey, S, Section, ServoKey, type_of
+from dxlrun.features.feature import Feature, JointKey, PolicyKey, PoseStage, S, Section, ServoKey, type_of
 from dxlrun.installed_plugins import InstalledPlugin, installed_plugins
 
 FEATURES = (
@@ -35,11 +35,14 @@ _JOINTS = (
     "reach_lower reach_upper upper velocity velocity_source"
 )
 _SECTIONS = "arguments include joint_defaults loop model name poses processes read_before simulation"
-_REPORT = "robot rate joints groups omitted controllers buses policies motions graph duration online"
+_REPORT = "robot rate joints groups omitted poses controllers buses policies motions graph duration online"
 """Keys of the report of `dxlrun check`; a feature cannot have one as its name, because its rows are added
 there under its name."""
-RESERVED: Mapping[type[Section[Any] | JointKey[Any] | ServoKey[Any] | PolicyKey[Any]], str] = {
+RESERVED: Mapping[
+    type[Section[Any] | JointKey[Any] | ServoKey[Any] | PolicyKey[Any] | PoseStage[Any]], str
+] = {
     Section: f"{_REPORT} {_SECTIONS}",
+    PoseStage: _REPORT,
     JointKey: f"{_REPORT} {_JOINTS}",
     ServoKey: f"{_REPORT} {_JOINTS}",
     PolicyKey: f"{_REPORT} exit_timeout of_joint on_exit on_fault on_returned_servo",
@@ -105,7 +108,8 @@ def _find_fault(feature: Feature, found: Container[str]) -> str:
     names = {key.name for key in (*keys, *groups)}
     faults = {
         "another feature has this name": name in found,
-        "no STAGES, form.py, joint_key.py, servo_key.py or policy_key.py declares it": name not in names,
+        "no STAGES, form.py, joint_key.py, servo_key.py, policy_key.py or pose_form.py declares it": name
+        not in names,
         f"its files also declare {', '.join(sorted(names - {name}))}": len(names) > 1,
         "its name does not begin with a letter": name.startswith("_"),
         "dxlrun has a key with this name": any(name in RESERVED[type(key)].split() for key in keys),

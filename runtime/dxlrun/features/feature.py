@@ -165,6 +165,45 @@ class PolicyKey(msgspec.Struct, Generic[T], frozen=True):
         return value
 
 
+class SolvedPose(msgspec.Struct, frozen=True):
+    """Pose of the robot file, as positions of joints."""
+
+    positions: Mapping[str, float]
+    """Positions of joints, rad or m; empty: the pose needs a joint that the run omits."""
+    remark: str = ""
+    """Part of the pose that the joints do not reach; empty: none."""
+    figures: Mapping[str, float] = {}
+    """Figures for `dxlrun check`, by the heading of their column."""
+
+
+class LimitedJoint(Protocol):
+    """Anything with the limits of a joint, such as `JointPlan`."""
+
+    @property
+    def lower(self) -> float:
+        """Lowest position, rad or m; may be infinite."""
+
+    @property
+    def upper(self) -> float:
+        """Highest position."""
+
+
+class PoseStage(msgspec.Struct, Generic[T], frozen=True):
+    """Hook `STAGE` in a feature's `pose_form.py`: a form of poses, such as the place of a link.
+
+    A pose in the robot file, in a motion file, and in the parameters of a controller can have this form.
+    """
+
+    FILE: ClassVar[str] = "pose_form"
+
+    name: str
+    """Key that every pose in this form has as a text, such as `tip`; also the name of the feature."""
+    form: type[T]
+    solve: Callable[[T, str | None, Mapping[str, LimitedJoint]], SolvedPose]
+    """Returns the joints for a pose, the text of the URDF, and all joints of the run. Raises KeyError with
+    the name of a joint that the run lacks, or `Mistakes` with keys of the pose and texts `problem; fix`."""
+
+
 class Feature(msgspec.Struct, frozen=True):
     """One feature: its name and the Python package (or module) with its stages."""
 

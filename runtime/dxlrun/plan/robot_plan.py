@@ -10,7 +10,7 @@ import msgspec
 from dxlrun.description.frames.tree import FramesPlan
 from dxlrun.errors import Mark
 from dxlrun.features import FEATURES
-from dxlrun.features.feature import Feature
+from dxlrun.features.feature import Feature, SolvedPose
 from dxlrun.plan.loop_plan import LoopPlan, ScheduledCommand
 from dxlrun.plan.mechanics_plan import MechanicsPlan
 from dxlrun.plan.recording_plan import RecordingPlan
@@ -60,8 +60,8 @@ class Plan(msgspec.Struct, frozen=True):
     packages: dict[str, str] = {}
     """Distributions of the plug-in packages that run in this robot, by package: controllers, sensors, servo
     models, physics and hooks of the loop."""
-    poses: dict[str, dict[str, float]] = {}
-    """Positions of joints, rad or m, by the name of the pose that motions may use."""
+    poses: dict[str, SolvedPose] = {}
+    """Poses by name, which policies, motions and clients use."""
     mechanics: MechanicsPlan = MechanicsPlan()
     """Assignment of servos to joints; empty: each joint has one servo."""
 

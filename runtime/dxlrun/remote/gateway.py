@@ -42,6 +42,7 @@ from dxlrun.channels.loop_requests import (
     Unload,
 )
 from dxlrun.compile.motions import with_poses
+from dxlrun.compile.problems import Problems
 from dxlrun.contract.controller import Outcome
 from dxlrun.description.motion import parse_motion
 from dxlrun.description.source_names import SOURCE_COMMANDS
@@ -455,7 +456,7 @@ class GatewayApp:
         try:
             plan = self._link.plan
             motion = parse_motion(given.text, Path(file), plan.groups, plan.omitted)
-            motion = with_poses(motion, self._preparation.poses)
+            motion = with_poses(motion, self._preparation.poses, Problems())
             # Read after parsing, which may have taken long: the motion begins where the joints are now.
             record = self._newest()
             controllers = {

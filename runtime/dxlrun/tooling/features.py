@@ -38,7 +38,6 @@ if TYPE_CHECKING:
     from dxlrun.compile.joints.described_servos import DescribedServo as DescribedServo
     from dxlrun.compile.problems import RobotFile as RobotFile
     from dxlrun.contract.hardware import Hardware as Hardware
-    from dxlrun.contract.named_pose import PoseStage as PoseStage
     from dxlrun.control.monitors.monitor_stage import Monitor as Monitor
     from dxlrun.control.monitors.monitor_stage import MonitorStage as MonitorStage
     from dxlrun.control.monitors.policy_actions import PolicyActions as PolicyActions
@@ -60,9 +59,12 @@ if TYPE_CHECKING:
     from dxlrun.dynamixel.hardware_layer import PreparedLayer as PreparedLayer
     from dxlrun.features.feature import Feature as Feature
     from dxlrun.features.feature import JointKey as JointKey
+    from dxlrun.features.feature import LimitedJoint as LimitedJoint
     from dxlrun.features.feature import PolicyKey as PolicyKey
+    from dxlrun.features.feature import PoseStage as PoseStage
     from dxlrun.features.feature import Section as Section
     from dxlrun.features.feature import ServoKey as ServoKey
+    from dxlrun.features.feature import SolvedPose as SolvedPose
     from dxlrun.plan.loop_plan import SourcePlan as SourcePlan
     from dxlwire.bus_plan import RegisterValue as RegisterValue
     from dxlwire.exchange.bus_engine import Lines as Lines

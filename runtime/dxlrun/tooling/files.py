@@ -21,6 +21,7 @@ from dxlwire.faces import lazy_face
 
 if TYPE_CHECKING:
     from dxlrun.description.base_form import Form as Form
+    from dxlrun.description.base_form import Mistakes as Mistakes
     from dxlrun.description.base_form import Name as Name
     from dxlrun.description.base_form import key as key
     from dxlrun.description.base_form import validation_error as validation_error

@@ -15,7 +15,7 @@ from dxlrun.description.joints.joint_forms import Joint, ServoJoint, SharedJoint
 from dxlrun.description.reading import Description
 from dxlrun.errors import Mark
 from dxlrun.features import installed_features, stages
-from dxlrun.features.feature import Feature, JointKey, PolicyKey, Section, ServoKey, Stage
+from dxlrun.features.feature import Feature, JointKey, PolicyKey, PoseStage, Section, ServoKey, Stage
 from dxlwire.joint_unit import JointUnit
 
 AUTO = "auto"  # in place of a model, which is then read from the servo
@@ -80,6 +80,7 @@ def used_features(description: Description) -> tuple[Feature, ...]:
     parents: dict[type[Stage], list[KeyPath]] = {
         Section: [()],
         PolicyKey: [("policies",), *(("policies", "groups", name) for name in robot.policies.groups)],
+        PoseStage: [("poses", name) for name in robot.poses],
         JointKey: [("joints", name) for name in robot.joints],
         ServoKey: [place for servo in servos for place in (servo.place, servo.defaults)],
     }

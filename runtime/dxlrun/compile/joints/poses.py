@@ -13,14 +13,16 @@ from types import UnionType
 from typing import Annotated, Final, Union, get_args, get_origin
 
 import msgspec
+from msgspec.structs import replace
 from pydantic import BaseModel, ValidationError
 
-from dxlrun.contract.named_pose import NAMED_POSE, PoseStage
-from dxlrun.description.base_form import ParametersModel
+from dxlrun.contract.named_pose import NAMED_POSE
+from dxlrun.description.base_form import Mistakes, ParametersModel
 from dxlrun.description.document import KeyPath
 from dxlrun.description.form_problems import data_problems
+from dxlrun.description.robot import pose_stages
 from dxlrun.errors import suggestion, what_and_fix
-from dxlrun.features import installed_features, stages
+from dxlrun.features.feature import SolvedPose
 from dxlrun.plan.loop_plan import JointPlan
 
 _MOST_MISTAKES: Final = 5
@@ -29,21 +31,22 @@ _EACH: Final = -1
 
 
 class WrongPose(ValueError):
-    """Raised for a pose without positions of joints, with each problem and its fix.
+    """Raised for a pose without positions of joints.
 
-    There are none if the mistake is already reported.
+    Args:
+        problems: Path of a key in the pose, the problem and the fix; none if the mistake is already reported.
+        lacking: Joint that the pose needs, and that the run does not have.
     """
 
-    def __init__(self, *problems: tuple[str, str]) -> None:
-        super().__init__("; ".join(map("; ".join, problems)))
-        self.problems = problems
+    def __init__(self, *problems: tuple[KeyPath, str, str], lacking: str = "") -> None:
+        super().__init__("; ".join(f"{what}; {fix}" for _, what, fix in problems))
+        self.problems, self.lacking = problems, lacking
 
 
 class Poses(msgspec.Struct, frozen=True):
     """Poses of a robot: those with names, and those that features solve."""
 
-    named: Mapping[str, Mapping[str, float]] = {}
-    """Positions of joints, rad or m; empty: the pose needs a joint that the run omits."""
+    named: Mapping[str, SolvedPose] = {}
     joints: Mapping[str, JointPlan] = {}
     omitted: Sequence[str] = ()
     """Joints and groups that the run omits."""
@@ -54,64 +57,76 @@ class Poses(msgspec.Struct, frozen=True):
     mistaken: Collection[str] = ()
     """Poses with a mistake, which is reported."""
 
-    def find_positions(self, written: object) -> Mapping[str, float] | None:
-        """Return the positions of the pose with a name, or of a pose in the form of a feature; None: neither.
+    def find_pose(self, written: object) -> SolvedPose | None:
+        """Return the pose with a name, or a pose in the form of a feature; None: neither.
 
         Raises:
-            WrongPose: The name is unknown, the pose needs an omitted joint, or a feature refuses it.
+            WrongPose: The name is unknown, a joint of the pose is omitted, or a feature refuses the pose.
         """
         if isinstance(written, str):
             return self.find_named(written)
         if not isinstance(written, Mapping) or written.keys() <= self.joints.keys():
             return None
-        for _, stage in stages(PoseStage, installed_features()):
-            if stage.key in written:
-                return self._solve(stage, written)
+        for stage in pose_stages():
+            if stage.name in written:
+                try:
+                    return self.solve_pose(stage.form.model_validate(written))
+                except ValidationError as error:
+                    found = data_problems(error, "the pose", stage.form, _MOST_MISTAKES)
+                    raise WrongPose(*(((), problem.what, problem.fix) for problem in found)) from None
         return None
 
-    def _solve(self, stage: PoseStage[BaseModel], written: object) -> Mapping[str, float]:
+    def solve_pose(self, pose: BaseModel) -> SolvedPose:
+        """Return a pose in the form of a feature; raise WrongPose as `find_pose`."""
         if self.has_mistakes:
             raise WrongPose
+        solve = next(one.solve for one in pose_stages() if isinstance(pose, one.form))
         try:
-            return stage.solve(stage.form.model_validate(written), self.urdf, self.joints)
-        except ValidationError as error:
-            found = data_problems(error, "the pose", stage.form, _MOST_MISTAKES)
-            raise WrongPose(*((problem.what, problem.fix) for problem in found)) from None
-        except ValueError as error:
-            raise WrongPose(what_and_fix(error)) from None
+            return solve(pose, self.urdf, self.joints)
+        except KeyError as error:
+            joint = str(error.args[0])
+            what = f"the pose needs {joint}, which is omitted or has no servo"
+            raise WrongPose(((), what, f"run with {joint}, or add it to `joints`"), lacking=joint) from None
+        except Mistakes as error:
+            raise WrongPose(*((path, *what_and_fix(text)) for path, text in error.found)) from None
 
-    def find_named(self, name: str) -> Mapping[str, float]:
-        """Return the positions of the pose with a name; raise WrongPose as `find_positions`."""
-        if positions := self.named.get(name):
-            return {joint: at for joint, at in positions.items() if joint in self.joints}
+    def find_named(self, name: str) -> SolvedPose:
+        """Return the pose with a name; raise WrongPose as `find_pose`."""
+        if (pose := self.named.get(name)) and pose.positions:
+            own = {joint: at for joint, at in pose.positions.items() if joint in self.joints}
+            return replace(pose, positions=own)
         if name in self.mistaken:
             raise WrongPose
         if name in self.named:
             joints = ", ".join(self.omitted)
-            raise WrongPose((f"pose {name} needs a joint that is omitted ({joints})", f"run with {joints}"))
-        known = [each for each, positions in self.named.items() if positions]
+            what = f"pose {name} needs a joint that is omitted ({joints})"
+            raise WrongPose(((), what, f"run with {joints}"))
+        known = [each for each, pose in self.named.items() if pose.positions]
         fix = suggestion(name, known) if known else "add it to `poses` of the robot file"
-        raise WrongPose((f"the robot has no pose {name}", fix))
+        raise WrongPose(((), f"the robot has no pose {name}", fix))
 
     def put_in(
         self, written: object, model: type[BaseModel]
     ) -> tuple[object, list[tuple[KeyPath, str, str]]]:
         """Return a command or parameters with positions of joints in place of poses, and the mistakes.
 
-        A wrong pose becomes one without joints. Parameters get texts with units, commands numbers in SI. Each
-        mistake is the path of the pose, the problem and the fix.
+        A wrong pose becomes one without joints. Parameters get texts with units, commands the data of a
+        `JointPose`. Each mistake is the path of the pose, the problem and the fix.
         """
         wrong: list[tuple[KeyPath, str, str]] = []
 
         def put_positions(value: object, at: KeyPath) -> object:
             try:
-                found = self.find_positions(value)
+                found = self.find_pose(value)
             except WrongPose as error:
-                wrong.extend((at, *problem) for problem in error.problems)
+                wrong.extend(((*at, *path), what, fix) for path, what, fix in error.problems)
                 return {}
-            if found is None or not issubclass(model, ParametersModel):
-                return value if found is None else found
-            return {joint: f"{float(value)!r} {self.joints[joint].unit.si}" for joint, value in found.items()}
+            if found is None:
+                return value
+            if not issubclass(model, ParametersModel):
+                return {"positions": found.positions, "remark": found.remark}
+            own = found.positions.items()
+            return {joint: f"{float(at)!r} {self.joints[joint].unit.si}" for joint, at in own}
 
         for place in pose_places(model):
             written = _replaced(written, place, (), put_positions)

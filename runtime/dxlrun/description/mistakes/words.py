@@ -271,7 +271,7 @@ def misplaced_sections(
 
 def words_for(form: str, keys: Collection[str]) -> frozenset[str]:
     """Return the foreign terms, in this form, for any of these keys."""
-    return frozenset(word for word, meaning in _table()[form].items() if meaning.place[0] in keys)
+    return frozenset(word for word, meaning in _table().get(form, {}).items() if meaning.place[0] in keys)
 
 
 @cache
