@@ -16,13 +16,13 @@ without any it is a good one), and what is expected of the verdict on it:
 """
 
 import math
-import re
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 from msgspec import structs
 from tests.kit.cases import TextCase, place_of, read_form
+from tests.kit.totals import holds
 
 from dxlrun import LINEAR, ROTARY
 from dxlrun.channels.event_records import RUN_ENDED, EventCode, EventGroup, GoalReport, GoalTotals, Severity
@@ -196,30 +196,3 @@ def check_case(case: TextCase) -> None:
     )
     for place, text in expected:
         assert holds(verdict, text), f"{place}: {text}\n{verdict.word}\n{shown}"
-
-
-def holds(verdict: Any, text: str) -> bool:
-    """Check whether a line of what is expected is true of a verdict."""
-    word, _, rest = text.partition(": ")
-    if text in ("good", "not good"):
-        return bool(verdict.good == (text == "good"))
-    if text.startswith("word "):
-        return bool(verdict.word == text.removeprefix("word "))
-    if word.isdigit():
-        return bool(verdict.sentences[int(word)].startswith(rest))
-    if word.endswith(" lacks"):
-        return rest not in verdict.sentences[int(word.removesuffix(" lacks"))]
-    if word in ("any", "none"):
-        return any(rest in one.line for one in verdict.findings) == (word == "any")
-    found = re.fullmatch(r"(has|no fix|no|says|fix) (\w+) ?(.*?)(?: as (\w+))?", word)
-    assert found, f"{text!r} is not expected of a verdict"
-    kind, code, subject, rank = found.groups()
-    own = [one for one in verdict.findings if one.code == code and subject in ("", one.subject)]
-    checks = {
-        "has": lambda: any(rank in (None, one.rank.name.lower()) for one in own),
-        "no": lambda: not own,
-        "says": lambda: any(rest in one.sentence for one in own),
-        "fix": lambda: any(rest in one.remedy for one in own),
-        "no fix": lambda: own and not any(one.remedy and rest in one.remedy for one in own),
-    }
-    return bool(checks[kind]())

@@ -8,18 +8,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
-from tests.kit.virtual_run import VirtualRun, send
 
 from dxlrun.channels.cycle import Torque
 from dxlrun.plan.loop_plan import JointPlan
-from dxlrun.testing import simulated_robot
 from dxlrun_analysis.finding import Finding, Rank
 from dxlrun_analysis.joints.following import followed
 from dxlrun_analysis.joints.joint_columns import JointColumns
 from dxlrun_analysis.joints.movement import Movement
 from dxlrun_analysis.joints.planned import PlannedJoint
 from dxlrun_analysis.joints.trail import STEP_S, Trail
-from dxlrun_analysis.report import analyze, analyze_log
 
 Floats = npt.NDArray[np.float64]
 DT = 0.02
@@ -221,23 +218,6 @@ def test_what_a_joint_may_do_is_no_jump(joint):
     assert "position_jumped" not in {code for code, *_ in told(joint)}
 
 
-WHEEL = """\
-name: wheel
-buses: {main: {port: sim, protocol: 1.0, baud_rate: 1_000_000, adapter: {kind: direct}}}
-loop: {rate: 50}
-joints: {w: {bus: main, id: 1, model: AX-12A, reference: 150 deg, direction: 1, continuous: true}}
-controllers: {c: {type: joint_group_velocity_controller, joints: [w]}}
-"""
-
-
-def test_wheel_whose_position_wraps_is_not_accused_of_a_slipping_gear(tmp_path):
-    """An AX-12A counts 300 degrees of a turn (e-Manual AX-12A, Present Position (36))."""
-    asked = {20: [send("c", "velocities", 3.0)]}
-    log = VirtualRun.of_text(tmp_path, WHEEL, 5.0, asked=asked).finish()
-    assert np.abs(np.diff(log.cycles["position"][:, 0])).max() > 5.0, "it wrapped"
-    assert "position_jumped" not in {one.code for one in analyze(log).verdict.findings}
-
-
 # Joints that do what they can
 
 LIFT = np.clip(TIME - 4.0, 0.0, 0.8)
@@ -421,50 +401,3 @@ def test_joint_is_compared_with_the_lag_of_its_kind():
     assert [one.lag_s for one in followed(planned, trail.samples())] == pytest.approx([0.04] * 3)
     other = [*planned[:2], PlannedJoint("j2", tick=TICK, top_effort=1.0, alike="MX")]
     assert [one.lag_s for one in followed(other, trail.samples())] == pytest.approx([0.04, 0.04, 0.1])
-
-
-ROBOT = """name: weak
-buses: {main: {port: sim, protocol: 2.0, baud_rate: 1_000_000, adapter: {kind: direct}}}
-loop: {rate: 50}
-joint_defaults: {bus: main, model: XL-320, reference: 150 deg, direction: 1, limits: {velocity: 3 rad/s}}
-joints:
-  a:
-    id: 1
-    limits: {position: [-120 deg, 120 deg]}
-    simulation: {gravity: 0.12 Nm, inertia: 0.001 kg m^2, gravity_angle: -90 deg}
-    TOLERANCE
-controllers:
-  arm: {type: joint_trajectory_controller, joints: [a], tolerances: {GOAL}}
-"""
-MOTION = """name: up
-motions:
-  - controller: arm
-    points:
-      - {time: 1 s, joints: {a: {position: 0 deg}}}
-      - {time: 2 s, joints: {a: {position: 20 deg}}}
-"""
-
-
-@pytest.mark.parametrize(
-    ("joint", "goal", "good"),
-    [
-        ("", "", False),
-        ("tolerance: 10 deg", "", False),
-        ("tolerance: 40 deg", "", True),
-        ("tolerance: {position: inf, velocity: inf}", "", True),
-        ("", "goal: 40 deg", True),
-    ],
-)
-def test_joint_is_blocked_only_beyond_its_tolerance(tmp_path, joint, goal, good):
-    (tmp_path / "robot.yaml").write_text(ROBOT.replace("TOLERANCE", joint).replace("GOAL", goal))
-    (tmp_path / "up.yaml").write_text(MOTION)
-    log = tmp_path / "run.mcap"
-    simulated_robot(tmp_path / "robot.yaml", play=[tmp_path / "up.yaml"], log=log).run()
-
-    verdict = analyze_log(log).verdict
-
-    assert verdict.good == good, verdict.sentences
-    first = verdict.sentences[0]
-    assert ("1 of 1 goal reached" in first) == good
-    still = {"stood_still", "follows_worse"}
-    assert bool(still & {one.code for one in verdict.findings}) != good, verdict.sentences

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 from msgspec import structs
 from tests.analysis.judged import MS, totals
+from tests.kit.cases import TextCase
 from tests.kit.made_logs import Cycle, Said, Wire, loop_of
+from tests.kit.told_stories import check_story, story_parameters
 from tests.kit.totals import totals_of
 from tests.kit.virtual_run import VirtualRun, ask, rate
 
@@ -239,21 +241,9 @@ def test_json_and_run_have_the_same_verdict(storm, tmp_path):
     assert any("log is incomplete" in sentence for sentence in judge_run(totals_of(cut)).sentences)
 
 
-def test_motion_that_a_controller_begins_is_not_one_of_clients(tmp_path):
-    log = tmp_path / "run.mcap"
-    simulated_robot(ROBOTS / "fall_reflex.yaml", duration_s=1.0, log=log).run()
-    assert "; moved by its controllers within" in judge_run(totals_of(log)).sentences[0]
-
-
-def test_robot_that_its_fall_reflex_could_not_keep_up_fell(tmp_path):
-    motion, log = ROBOTS / "motions/fall_reflex_tip.yaml", tmp_path / "run.mcap"
-    simulated_robot(ROBOTS / "fall_reflex.yaml", play=[motion], log=log).run()
-    verdict = judge_run(totals_of(log))
-    assert not verdict.good
-    assert verdict.sentences[0].startswith(
-        "Not good: the robot fell at 1.6 s and did not get up; play of wave aborted; played fall_reflex_tip "
-    )
-    assert verdict.findings[1].code == "fell"
+@pytest.mark.parametrize("case", [*story_parameters(Path(__file__).with_name("stories"))])
+def test_story(case: TextCase, tmp_path: Path) -> None:
+    check_story(case, tmp_path)
 
 
 @pytest.fixture(scope="module")

@@ -107,25 +107,6 @@ def test_refused_goal_of_a_client_does_not_count(story):
         assert (history.totals.asked, len(history.totals.failed)) == (asked, asked)
 
 
-def test_deactivation_aborts_the_goal_and_a_result_that_comes_later_counts_no_more(story):
-    story.mover.on_deactivate = lambda self, time_ns: self.goal.end(Outcome.REACHED)
-    story.run(5, {1: story.moves(50), 3: story.switches((), ["arm"])})
-    assert story.timed == [(1, "accepted"), (3, "aborted")]
-    assert story.reports[-1][1].text == "arm was deactivated"
-
-
-def test_pause_that_expires_aborts_the_goal_with_the_reason_and_resume_names_the_next_step(
-    story, monkeypatch
-):
-    monkeypatch.setattr("dxlrun.control.steering.PAUSE_LEASE_NS", 3 * PERIOD_NS)
-    at = {1: story.moves(50), 2: story.asks("pause"), 9: story.asks("resume"), 11: story.switches(["arm"])}
-    story.run(15, at | {13: story.asks("resume")})
-    assert story.reports[-1][1].text == "no client ended the pause"
-    not_paused = "the loop is not paused"
-    hint = "no controller commands its joints; activate one by `dxlrun switch --activate NAME`"
-    assert [story.refusals[command] for command in (3, 5)] == [f"{not_paused}; {hint}", not_paused]
-
-
 @pytest.mark.parametrize("outcome", ["arrived", None, 3])
 def test_an_outcome_that_is_none_is_the_controllers_fault(story, outcome):
     story.mover.update = lambda self, *_: self.goal.end(outcome) if self.goal else None

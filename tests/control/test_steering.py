@@ -158,24 +158,6 @@ def test_the_controllers_time_goes_on_when_a_loop_that_catches_up_is_paused(paus
         assert (np.diff(left.times("left")) > 0).all()
 
 
-@pytest.mark.parametrize("policies", [PolicyPlan(), STRICT])
-def test_a_pause_ends_by_policy_when_its_client_has_left(left, monkeypatch, policies):
-    monkeypatch.setattr("dxlrun.control.steering.PAUSE_LEASE_NS", 5 * PERIOD_NS)
-    there, other = left.asks("rate", rate=50.0), left.posts("left", "position")
-    result = left.run(20, {2: left.asks("pause"), 5: there, 7: other}, policies=policies)
-    ((source, text),) = left.events.of(EventCode.STALE_COMMAND)
-    if policies is STRICT:
-        assert result.reason == "fault"
-        assert "no client ended the pause; on_stale_command: limp" in result.detail
-        assert (source, text) == ("loop", "no client ended the pause; the run ends: limp")
-        assert left.column("cycle")[-1] == 11
-    else:
-        assert result.reason == "stopped"
-        assert text.endswith("its controllers are deactivated, and the joints are held")
-        assert (left.steps("left"), left.column("cycle")[-1]) == ([0, 1], 19)
-        assert left.loop.steering.paused is False
-
-
 def test_another_rate_begins_at_the_next_deadline_and_controllers_keep_theirs(left):
     left.script("right", joints=("j1",), every=2, rate=25.0)
     left.run(13, {4: left.asks("rate", rate=100.0)})

@@ -94,6 +94,8 @@ class Scripted(dxlrun.Controller[ScriptedParameters]):
 
     def on_deactivate(self, time_ns: int) -> None:
         self._step("deactivate")
+        if self.goal is not None:
+            self.goal.end(dxlrun.Outcome.REACHED)  # too late: it is aborted
 
     def on_parameters(self, time_ns: int) -> None:
         self._step("parameters")

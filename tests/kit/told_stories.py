@@ -9,6 +9,7 @@ The texts have the form of `tests/kit/cases.py`. The head is a robot file, or a 
       play                             the motion of this text, one of `robots/motions`, or a name
       jam servo=2 at=500ms             a fault, as `dxlrun --fault` has it
       hand servo=2 by=-30 at=1300ms    a hand turns a shaft by degrees at once, against the servo
+      stands servo=2 200               where a shaft is when its servo gets power, deg from raw 0
       poke servo=2 max_torque 500      a register before the run, or `... 500 at=1200ms` then
       mute servo=2 at=500ms for=60ms   replies are lost, while the servo executes its instructions
       busy at=500ms for=50ms           a cycle takes so much longer
@@ -23,12 +24,15 @@ Expected are each goal that ends, events (`=> event arm turns...`, `=> no event 
 elbow from 1.5 to 2: 0.29 to 0.31`, with `spread` before the numbers for the difference of the largest and
 the smallest one, `step` for the largest one of neighbours, `bend` for that of two steps, `in 100 ms` for
 the largest change in a time, `most` for the largest amount. Without a time it is the last cycle. `=> topic
-/pid/state: 0 to 30` is about the ms between its messages, `=> lasts 1.5 to 2 s` about the whole run. `=>
+/pid/state: 0 to 30` is about the ms between its messages, `=> cycles woken_ns: 20 to 100` between cycles,
+`=> active arm at 1: 0` about a controller, `=> lasts 1.5 to 2 s` and `=> skips 4` about the whole run. `=>
 wrote 1 led: 1 0` has the values that a servo was sent, by the ledger, `=> sent 1/goal_velocity from 1 to 2:
-step 0 to 4` measures them, and `=> goals 1: 30 32` has the addresses of its goals in turn. `...` stands for
-any text. Each run is equal to its replay. `needs physics` names an extra. A case may have several runs: by
-`NAME = a | b` its `NAME` stands for one text after the other, and two do by `NAME OTHER = a ; b | c ; d`,
-and by more lines of the same names.
+step 0 to 4` measures them, and `=> goals 1: 30 32` has the addresses of its goals in turn. `=> refused ...`
+has each request that was. `=> verdict not good`, or another line of `tests/analysis/judged.py`, is about the
+analysis, which counts the states of `=> invalid elbow: 0 to 2`. `...` stands for any text. Each run is equal
+to its replay. `needs physics` names an extra. A case may have several runs: by `NAME = a | b` its `NAME`
+stands for one text after the other, and two do by `NAME OTHER = a ; b | c ; d`, and by more lines of the
+same names.
 """
 
 import json
@@ -45,13 +49,17 @@ import pytest
 import yaml
 from tests.kit.cases import Line, TextCase, fits, place_of, read_cases, read_form
 from tests.kit.line_faults import lose_replies, turn_by_hand
+from tests.kit.totals import holds, totals_of
 from tests.kit.virtual_run import MS, VirtualRun, ask, source_states
 from tests.kit.wire import SYNC_WRITE, taken_apart, writes
 
+from dxlrun.channels.answers import Code, Refusal
 from dxlrun.channels.event_records import EventCode
 from dxlrun.compile.motion_names import is_name
 from dxlrun.log.log_reader import Log, open_log, read_log
+from dxlrun_analysis.joints.goal_tracking import tracking
 from dxlrun_analysis.replay import replay_log
+from dxlrun_analysis.verdict import judge_run
 from dxlsim.faults.kinds import KINDS
 
 ROBOTS = Path(__file__).parents[2] / "robots"
@@ -74,6 +82,12 @@ def request(run: VirtualRun, *words: str) -> None:
 def turn(run: VirtualRun, servo_id: str, degrees: str, ms: str) -> None:
     servo = run.servo(int(servo_id))
     run.at(int(ms), lambda: turn_by_hand(servo, servo.shaft.angle + math.radians(float(degrees))))
+
+
+def place(run: VirtualRun, servo_id: str, degrees: str) -> None:
+    servo = run.servo(int(servo_id))
+    turn_by_hand(servo, math.radians(float(degrees)))
+    servo.power_cycle()  # it forgets its turn
 
 
 def mute(run: VirtualRun, servo_id: str, ms: str, for_ms: str) -> None:
@@ -99,6 +113,7 @@ def poke(run: VirtualRun, servo_id: str, item: str, value: str, ms: str | None) 
 
 EVENTS: dict[str, Callable[..., None]] = {
     r"hand servo=(\d+) by=([-\d.]+) at=(\d+)ms": turn,
+    r"stands servo=(\d+) ([-\d.]+)": place,
     r"mute servo=(\d+) at=(\d+)ms for=(\d+)ms": mute,
     r"busy at=(\d+)ms for=(\d+)ms": delay,
     r"poke servo=(\d+) (\w+) (-?\d+)(?: at=(\d+)ms)?": poke,
@@ -150,7 +165,9 @@ class Story:
             happens(run)
         run.sample(map(run.servo, self.shafts), LOOK_MS, end_ms=self.seconds * 1000)
         self.result = run.run()
-        run.require_done()
+        answers = [run.inbox.answers[number] for number in sorted(run.inbox.answers)]
+        assert len(answers) == run.inbox.count, f"{len(answers)} of {run.inbox.count} requests were answered"
+        self.refused = [one for one in answers if isinstance(one, Refusal) and one.code != Code.GOAL_REFUSED]
         assert replay_log(path).same
         self.log: Log = read_log(path)
         ended = [event for event in self.log.events if event.code == EventCode.GOAL_ENDED]
@@ -174,6 +191,14 @@ class Story:
             ]
             found = sum(fits(one, text) for one in texts)
             assert found == int(count) if count else bool(found) == (word == "event"), texts
+        elif word == "refused":
+            assert fits(self.refused[0].text, rest), self.refused
+            self.refused.pop(0)
+        elif word == "verdict":
+            verdict = judge_run(totals_of(self.folder / "run.mcap"))
+            assert holds(verdict, rest), (verdict.sentences, verdict.findings)
+        elif word == "skips":
+            assert self.result.skipped == int(rest), self.result
         elif word == "lasts":
             least, most = map(float, rest.removesuffix(" s").split(" to "))
             assert least <= (lasted := self.virtual.clock.now_ns() * 1e-9) <= most, lasted
@@ -213,6 +238,12 @@ class Story:
     def values(self, column: str, name: str, match: re.Match[str]) -> Any:
         """Return what a line is about: values, or what it measures of them."""
         period_s = self.virtual.plan.loop.period_ns * 1e-9
+        if column == "invalid":
+            counted = totals_of(self.folder / "run.mcap").invalid
+            assert self.result.invalid == counted == tuple(joint.invalid for joint in tracking(self.log))
+            return np.array([counted[self.log.joints.index(name)]])
+        if column == "cycles":
+            return np.diff(self.log.cycles[name].astype(np.int64)) / 1e6
         if column == "topic":
             return np.diff(open_log(self.folder / "run.mcap").columns(name)["t_ns"]) / 1e6
         if column == "sent":
@@ -227,6 +258,9 @@ class Story:
             period_s = LOOK_MS * 1e-3
         elif column == "source_state":
             rows = source_states(self.log)[name]
+        elif column == "active":
+            names = [one.name for one in self.virtual.plan.loop.controllers]
+            rows = self.log.cycles["active"] >> names.index(name) & 1
         else:
             names = self.log.joints if "/" not in name else self.virtual.record.layout.references
             rows = self.log.cycles[column][:, list(names).index(name)]
@@ -243,6 +277,7 @@ class Story:
     def finish(self) -> None:
         """Check that nothing ended which the story does not expect."""
         assert not self.goals, self.goals
+        assert not self.refused, self.refused
         if self.result is not None:
             assert (self.result.reason, self.result.detail) == ("ended", "")
 

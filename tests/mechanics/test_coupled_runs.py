@@ -1,4 +1,4 @@
-"""Servos of coupled joints that disagree or stand outside limits; runs: robots/stories/coupled.txt."""
+"""Servos of coupled joints that disagree or are outside limits; runs: coupled.txt, crossing.txt in robots."""
 
 import math
 from functools import partial
@@ -7,7 +7,7 @@ import pytest
 from msgspec.structs import replace
 from tests.kit.kept_events import Events
 from tests.kit.line_faults import turn_by_hand
-from tests.kit.virtual_run import VirtualRun, send, torque
+from tests.kit.virtual_run import VirtualRun, torque
 
 from dxlrun.channels.answers import Refusal
 from dxlrun.channels.cycle import Commands, States
@@ -19,24 +19,6 @@ from dxlrun.features.mechanics.joint_hardware import CouplingCheck
 from dxlrun.run import virtual_run
 
 pytestmark = pytest.mark.long
-
-CROSSING = """\
-name: neck
-buses: {main: {port: sim, protocol: 2.0, baud_rate: 1_000_000, return_delay_time: 0 us}}
-loop: {rate: 50}
-joints:
-  pitch: {limits: {position: [-40 deg, 40 deg], velocity: 2 rad/s}}
-  roll: {limits: {position: [-60 deg, 60 deg], velocity: 2 rad/s}}
-transmissions:
-  neck_gear:
-    type: differential
-    joints: [pitch, roll]
-    servos:
-      left: {bus: main, id: 1, model: XM430-W350, reference: 10 deg, direction: 1}
-      right: {bus: main, id: 2, model: XM430-W350, reference: 350 deg, direction: -1}
-controllers: {neck: {type: joint_group_position_controller, joints: [pitch, roll]}}
-policies: {on_returned_servo: hold}
-"""
 
 
 def test_servos_that_disagree_are_refused_before_any_gets_torque(plan, monkeypatch):
@@ -111,32 +93,3 @@ def test_torque_comes_back_within_limits_only_and_if_servos_agree(plan, monkeypa
     assert answer.text.count(problem) == 1
     for servo in moved:
         assert not any(on for ms, on in robot.sent(servo, "torque_enable") if ms > 200)
-
-
-@pytest.mark.parametrize(("pitch", "roll"), [(0, 0), (38, -57), (-38, 58), (30, 50)])
-def test_servos_of_a_transmission_may_cross_raw_0(tmp_path, pitch, roll):
-    run = VirtualRun.of_text(tmp_path, CROSSING, 4.0)
-    left, right = (run.buses[0].servo(number) for number in (1, 2))
-
-    def angles(pitch, roll):
-        return 10 + (pitch + roll), 350 - (pitch - roll)
-
-    def off(pitch, roll):
-        pairs = zip((left, right), angles(pitch, roll), strict=True)
-        return max(
-            abs(math.remainder(math.degrees(servo.shaft_angle) - angle, 360)) for servo, angle in pairs
-        )
-
-    for servo, angle in zip((left, right), angles(pitch, roll), strict=True):
-        turn_by_hand(servo, math.radians(angle))
-        servo.power_cycle()  # it forgets its turn
-    found = []
-    run.at(480, lambda: found.append(off(pitch, roll)))
-    run.ask(500, send("neck", "positions", 0.3, -0.7))
-    run.fault("brownout servo=1 at=2s for=200ms")
-    run.at(3900, lambda: found.append(off(math.degrees(0.3), math.degrees(-0.7))))
-    log = run.finish()
-    assert max(found) < 1.5
-    assert found[0] < 0.1
-    assert log.cycles["position"][5] == pytest.approx([math.radians(pitch), math.radians(roll)], abs=0.002)
-    assert log.cycles["position"][-1] == pytest.approx([0.3, -0.7], abs=0.02)
