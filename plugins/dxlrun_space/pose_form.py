@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
 from dxlrun import Angle, Floats, Length
-from dxlrun.tooling.features import LimitedJoint, PoseStage, SolvedPose
+from dxlrun.tooling.features import PoseStage, SolvedPose
 from dxlrun.tooling.files import Form, Name, key
 from dxlrun.tooling.robots import Transform, from_rpy
 
@@ -91,7 +91,7 @@ def dexterity(chain: "Chain", postures: Iterable[Sequence[float]]) -> tuple[Floa
     return np.array(places), speeds[:, -1] / np.maximum(speeds[:, 0], 1e-12)
 
 
-def _solve(pose: TipPose, urdf: str | None, joints: Mapping[str, LimitedJoint]) -> SolvedPose:
+def _solve(pose: TipPose, urdf: str | None, joints: Mapping[str, tuple[float, float]]) -> SolvedPose:
     # Imported here, because most robot files have no pose of a link.
     from dxlrun_space.chain import BASE, WrongChain, chain_of
     from dxlrun_space.path import out_of_reach, remark_on
@@ -101,12 +101,12 @@ def _solve(pose: TipPose, urdf: str | None, joints: Mapping[str, LimitedJoint]) 
     for joint in pose.near:
         if joint not in chain.joints:
             raise WrongChain("near", f"{joint} does not move {pose.tip}", f"write {', '.join(chain.joints)}")
-    limits = [joints[joint] for joint in chain.joints]
+    lower, upper = zip(*(joints[joint] for joint in chain.joints), strict=True)
     near = [pose.near.get(joint) for joint in chain.joints]
-    solver = Solver(chain, [each.lower for each in limits], [each.upper for each in limits], near)
+    solver = Solver(chain, lower, upper, near)
     start = tuple(each or 0.0 for each in near)
     rotation = rotation_of(pose.quaternion, pose.rpy)
-    exact = rotation is not None and demands_orientation(None, len(limits))
+    exact = rotation is not None and demands_orientation(None, len(near))
     target = Transform((pose.x, pose.y, pose.z), rotation or BASE.rotation)
     search = solver.search(target, start, exact=exact) if rotation else solver.search_place(target, start)
     found = finish_search(search)

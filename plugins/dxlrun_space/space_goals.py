@@ -33,7 +33,7 @@ class TipGoal(msgspec.Struct, frozen=True, array_like=True):
     """Duration, s; None: the shortest."""
     positions: tuple[float, ...]
     """Positions of the joints, rad or m, in place of all above; empty: not given."""
-    remark: str
+    remark: str = ""
     """Part of the pose that these positions do not reach; empty: none."""
 
     def target(self, frame: Transform, tip: Transform) -> Transform:
@@ -141,7 +141,7 @@ class PoseCommand(CommandModel):
             path=self.path,
             seconds=self.seconds,
             positions=() if named is None else tuple(named[joint] for joint in joints),
-            remark="" if self.pose is None else self.pose.remark,
+            remark=self.pose.remark if self.pose else "",
         )
 
 

@@ -206,9 +206,9 @@ _MOTIONS: Columns[Row] = [
 
 
 def _poses(poses: Sequence[Row]) -> Table:
-    def margin(row: Row) -> str | None:
-        left, unit = row["margin"], LINEAR if row["linear"] else ROTARY
-        return None if left is None else f"{unit.text(left)} of {row['margin_joint']}"
+    def margin(row: Row) -> str:
+        unit = LINEAR if row["linear"] else ROTARY
+        return f"{unit.text(row['margin'])} of {row['margin_joint']}"
 
     def figure(name: str) -> tuple[Column, Callable[[Row], float | None]]:
         return Column(name, form="{:.2f}"), lambda row: row["figures"].get(name)

@@ -155,15 +155,14 @@ def _described(servo: DescribedServo) -> Row:
 
 
 def _pose(name: str, pose: SolvedPose, loop: LoopPlan) -> Row:
-    joints = {joint.name: joint for joint in loop.joints}
-    own = [(joints[joint], at) for joint, at in pose.positions.items()]
-    margin, nearest = min(
-        ((min(at - joint.lower, joint.upper - at), joint) for joint, at in own), key=lambda pair: pair[0]
-    )
+    own = [(joint, pose.positions[joint.name]) for joint in loop.joints if joint.name in pose.positions]
+    margins = [min(at - joint.lower, joint.upper - at) for joint, at in own]
+    margin = min(margins)
+    nearest, _ = own[margins.index(margin)]
     return {
         "name": name,
         **msgspec.structs.asdict(pose),
-        "margin": None if math.isinf(margin) else margin,
+        "margin": margin,
         "margin_joint": nearest.name,
         "linear": nearest.unit is LINEAR,
     }

@@ -52,15 +52,12 @@ def compile_poses(file: RobotFile, joints: Mapping[str, CompiledJoint], urdf: st
             named[name] = poses.solve_pose(written)
         except WrongPose as error:
             if error.lacking in poses.omitted:
-                what, fix = (
-                    f"pose {name} is omitted, because it needs {error.lacking}",
-                    f"run with {error.lacking}",
-                )
-                file.warning(file.key("poses", name), what, fix)
-                continue
-            mistaken.add(name)
-            for path, what, fix in error.problems:
-                file.error(file.at("poses", name, *path), f"{name}: {what}", fix)
+                what = f"pose {name} is omitted, because it needs {error.lacking}"
+                file.warning(file.key("poses", name), what, f"run with {error.lacking}")
+            else:
+                mistaken.add(name)
+                for path, what, fix in error.problems:
+                    file.error(file.at("poses", name, *path), f"{name}: {what}", fix)
     return replace(poses, named=named, mistaken=mistaken)
 
 

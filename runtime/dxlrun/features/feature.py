@@ -176,18 +176,6 @@ class SolvedPose(msgspec.Struct, frozen=True):
     """Figures for `dxlrun check`, by the heading of their column."""
 
 
-class LimitedJoint(Protocol):
-    """Anything with the limits of a joint, such as `JointPlan`."""
-
-    @property
-    def lower(self) -> float:
-        """Lowest position, rad or m; may be infinite."""
-
-    @property
-    def upper(self) -> float:
-        """Highest position."""
-
-
 class PoseStage(msgspec.Struct, Generic[T], frozen=True):
     """Hook `STAGE` in a feature's `pose_form.py`: a form of poses, such as the place of a link.
 
@@ -199,9 +187,10 @@ class PoseStage(msgspec.Struct, Generic[T], frozen=True):
     name: str
     """Key that every pose in this form has as a text, such as `tip`; also the name of the feature."""
     form: type[T]
-    solve: Callable[[T, str | None, Mapping[str, LimitedJoint]], SolvedPose]
-    """Returns the joints for a pose, the text of the URDF, and all joints of the run. Raises KeyError with
-    the name of a joint that the run lacks, or `Mistakes` with keys of the pose and texts `problem; fix`."""
+    solve: Callable[[T, str | None, Mapping[str, tuple[float, float]]], SolvedPose]
+    """Returns the joints for a pose, the text of the URDF, and the limits of all joints of the run, rad or m.
+    Raises KeyError with the name of a joint that the run lacks, or `Mistakes` with keys of the pose and texts
+    `problem; fix`."""
 
 
 class Feature(msgspec.Struct, frozen=True):

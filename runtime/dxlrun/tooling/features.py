@@ -59,7 +59,6 @@ if TYPE_CHECKING:
     from dxlrun.dynamixel.hardware_layer import PreparedLayer as PreparedLayer
     from dxlrun.features.feature import Feature as Feature
     from dxlrun.features.feature import JointKey as JointKey
-    from dxlrun.features.feature import LimitedJoint as LimitedJoint
     from dxlrun.features.feature import PolicyKey as PolicyKey
     from dxlrun.features.feature import PoseStage as PoseStage
     from dxlrun.features.feature import Section as Section

@@ -82,7 +82,9 @@ class Poses(msgspec.Struct, frozen=True):
             raise WrongPose
         solve = next(one.solve for one in pose_stages() if isinstance(pose, one.form))
         try:
-            return solve(pose, self.urdf, self.joints)
+            return solve(
+                pose, self.urdf, {joint.name: (joint.lower, joint.upper) for joint in self.joints.values()}
+            )
         except KeyError as error:
             joint = str(error.args[0])
             what = f"the pose needs {joint}, which is omitted or has no servo"
