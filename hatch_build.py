@@ -32,26 +32,19 @@ __all__ = [
     "get_requires_for_build_sdist",
     "get_requires_for_build_wheel",
 ]
+ROOT = Path(__file__).parent
 SOURCES = tuple(
-    Path(*path)
-    for path in (
-        ("runtime", "dxlwire", "exchange", "kernel.c"),
-        ("runtime", "dxlrun", "control", "gate.c"),
-        ("runtime", "dxlsim", "wire", "line.c"),
-        ("runtime", "dxlrun", "contract", "polynomial.c"),
-        ("runtime", "dxlrun", "channels", "shared_memory.c"),
-        ("runtime", "dxlsim", "motion", "mechanics.c"),
-        ("plugins", "dxlrun_analysis", "servos", "pairing.c"),
-        ("plugins", "dxlrun_analysis", "joints", "movement.c"),
-    )
+    source.relative_to(ROOT)
+    for pattern in ("runtime/*/*/*.c", "plugins/dxlrun_analysis/**/*.c")
+    for source in sorted(ROOT.glob(pattern))
 )
 """Each is compiled into an object of its own, which lies beside it: libkernel.so."""
 FLAGS = ("-std=c11", "-O2", "-fPIC", "-shared", "-ffp-contract=off", "-Wall", "-Wextra", "-Wconversion")
 """No contraction into fused operations: states and goals have the same bits on every processor."""
 
 
-def compile_kernel(root: Path, compiler: list[str], target: Path, name: Path = SOURCES[0]) -> str:
-    """Compile the kernel, or another source; return why that did not work, or nothing."""
+def compile_kernel(root: Path, compiler: list[str], target: Path, name: Path) -> str:
+    """Compile a source; return why that did not work, or nothing."""
     source = root / name
     crc = f"-DSOURCE_CRC={zlib.crc32(source.read_bytes())}u"
     with tempfile.TemporaryDirectory() as cache:
@@ -79,7 +72,7 @@ def system_compiler(root: Path) -> list[str]:
     found = os.environ.get("CC") or shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
     compiler = shlex.split(found or "")  # CC may have options, or a compiler cache in front
     with tempfile.TemporaryDirectory() as folder:
-        works = compiler and not compile_kernel(root, compiler, Path(folder, "libkernel.so"))
+        works = compiler and not compile_kernel(root, compiler, Path(folder, "library.so"), SOURCES[0])
     return compiler if works else []
 
 

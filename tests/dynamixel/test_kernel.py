@@ -325,7 +325,7 @@ def build(tmp_path, monkeypatch):
     """The build, in a folder that has the sources."""
     module = loaded(ROOT / "hatch_build.py")
     for source in module.SOURCES:
-        (tmp_path / source).parent.mkdir(parents=True)
+        (tmp_path / source).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(ROOT / source, tmp_path / source)
     monkeypatch.chdir(tmp_path)
     return module
@@ -342,7 +342,8 @@ def test_a_build_asks_for_a_compiler_where_none_works(build, tmp_path, monkeypat
         assert needed == (["first"] if works else ["first", "ziglang"])
     found = build.system_compiler(tmp_path)
     assert found == (compiler.split() if works else [])
-    why = build.compile_kernel(tmp_path, found or compiler.split(), tmp_path / "libkernel.so")
+    source = kernel.SOURCE.relative_to(ROOT)
+    why = build.compile_kernel(tmp_path, found or compiler.split(), tmp_path / "libkernel.so", source)
     assert bool(why) != works
     if works:
         kernel.library(path=tmp_path / "libkernel.so")

@@ -8,16 +8,9 @@ from pathlib import Path
 from dxlwire.compiled import load_compiled
 from dxlwire.exceptions import NotCompiled
 
+_PACKAGES = Path(__file__).parents[2]
 SOURCES = tuple(
-    Path(__file__).parents[2] / name
-    for name in (
-        "dxlrun/channels/shared_memory.c",
-        "dxlrun/contract/polynomial.c",
-        "dxlrun/control/gate.c",
-        "dxlsim/motion/mechanics.c",
-        "dxlsim/wire/line.c",
-        "dxlwire/exchange/kernel.c",
-    )
+    source for name in ("dxlrun", "dxlsim", "dxlwire") for source in sorted(_PACKAGES.glob(f"{name}/*/*.c"))
 )
 """Paths of the C files without which no robot runs."""
 
