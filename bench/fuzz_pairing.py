@@ -97,7 +97,7 @@ def pair(chance: random.Random) -> int:
     assert sorted(answers.tolist()) == np.flatnonzero(replies.answers).tolist()
     assert due.missing.tolist() == np.flatnonzero(due.reply < 0).tolist()
     assert len(due.exchange) == found.requests.servos[found.request].sum()
-    assert (found.count_due(np.arange(len(found.bus))) == np.bincount(due.servo, minlength=512)).all()
+    assert (found.count_due(found.times) == np.bincount(due.servo, minlength=512)).all()
     assert (pairing.counts.replies == np.bincount(replies.servo, minlength=512)).all()
     took_ns = replies.last_ns - found.asked_ns[replies.exchange]
     assert (replies.took_us == np.where(replies.answers, took_ns // 1000, 0)).all()

@@ -5,14 +5,23 @@
 
 from __future__ import annotations
 
+import ctypes
+from ctypes import byref, c_int64, c_void_p
+from functools import cache
+from pathlib import Path
+
 import numpy as np
 from numpy.typing import NDArray
 
+from dxlrun.tooling.compiled_code import load_compiled, parse_structs
+
 Numbers = NDArray[np.int64]
 
-_GROUP = 40  # Low bits of a key hold the value, shifted to be non-negative; the bits above hold its group
+SOURCE = Path(__file__).with_name("counts.c")
+_TABLE = parse_structs(SOURCE.read_text())["Table"]
+_GROUP = 40  # Layout of a key as in counts.c
 _ZERO = 1 << (_GROUP - 1)
-_MOST_PENDING = 1 << 18  # Values that are merged at once
+_FEWEST_SLOTS = 1 << 10
 _FEWEST = 10  # Fewer occurrences can be a coincidence
 _TIMES_MORE = 10
 
@@ -21,47 +30,56 @@ class Counts:
     """Counter of each distinct integer value in several groups, for example reply times in us by servo."""
 
     def __init__(self) -> None:
-        self._keys = np.zeros(0, np.int64)
-        self._counts = np.zeros(0, np.int64)
-        self._pending: list[Numbers] = []
-        self._waiting = 0
+        self._resize(_FEWEST_SLOTS)
+        self._sorted: tuple[Numbers, Numbers] | None = None  # Keys, ascending, and the count of each
+
+    def _resize(self, slots: int) -> None:
+        self._slots = np.zeros((2, slots), np.int64)  # Keys and counts
+        keys, counts = (row.ctypes.data for row in self._slots)
+        self._table = _TABLE(keys=keys, counts=counts, slots=slots)
 
     def count_values(self, group: Numbers, value: Numbers) -> None:
         """Count values in their groups.
 
         Args:
-            group: Group of each value, 0 to 2^23; shape (values,).
+            group: Group of each value, 0 to 2^23, or less than 0 to skip it; shape (values,).
             value: Values to count; shape (values,).
         """
-        key = np.clip(value, -_ZERO, _ZERO - 1)
-        key += _ZERO
-        key += group << _GROUP
-        self._pending.append(key)
-        self._waiting += len(value)
-        if self._waiting > _MOST_PENDING:
-            self._merge()
+        self._sorted, done = None, 0
+        group, value = (np.ascontiguousarray(each, np.int64) for each in (group, value))
+        while done < len(value):
+            rest = group[done:].ctypes.data, value[done:].ctypes.data, len(value) - done
+            done += _library().counts_add(byref(self._table), *rest)
+            if 2 * self._table.used >= self._slots.shape[1]:
+                full, slots = self._table, self._slots
+                self._resize(2 * slots.shape[1])
+                _library().counts_merge(byref(self._table), byref(full))
+
+    def _ascending(self) -> tuple[Numbers, Numbers]:
+        if self._sorted is None:
+            keys, counts = self._slots[:, self._slots[1] > 0]
+            order = np.argsort(keys)
+            self._sorted = keys[order], counts[order]
+        return self._sorted
 
     def counts_of(self, group: int) -> tuple[Numbers, Numbers]:
         """Return the distinct values that were counted in a group, ascending, and the count of each value."""
-        self._merge()
-        begin, end = np.searchsorted(self._keys, [group << _GROUP, (group + 1) << _GROUP])
-        return self._keys[begin:end] - (group << _GROUP) - _ZERO, self._counts[begin:end]
+        keys, counts = self._ascending()
+        begin, end = np.searchsorted(keys, [group << _GROUP, (group + 1) << _GROUP])
+        return keys[begin:end] - (group << _GROUP) - _ZERO, counts[begin:end]
 
     @property
     def groups(self) -> list[int]:
         """Numbers of the groups that have values, ascending."""
-        self._merge()
-        return sorted(set((self._keys >> _GROUP).tolist()))
+        return sorted(set((self._ascending()[0] >> _GROUP).tolist()))
 
-    def _merge(self) -> None:
-        if not self._pending:
-            return
-        new, counts = np.unique(np.concatenate(self._pending), return_counts=True)
-        keys, where = np.unique(np.concatenate([self._keys, new]), return_inverse=True)
-        total = np.zeros(len(keys), np.int64)
-        np.add.at(total, where, np.concatenate([self._counts, counts]))
-        self._keys, self._counts = keys, total
-        self._pending, self._waiting = [], 0
+
+@cache
+def _library() -> ctypes.CDLL:
+    found = load_compiled(SOURCE, ctypes.CDLL)
+    found.counts_add.argtypes, found.counts_add.restype = (c_void_p, c_void_p, c_void_p, c_int64), c_int64
+    found.counts_merge.argtypes, found.counts_merge.restype = (c_void_p, c_void_p), None
+    return found
 
 
 def quantile(values: Numbers, counts: Numbers, share: float) -> float:

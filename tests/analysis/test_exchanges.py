@@ -1,5 +1,6 @@
 """Exchanges on the buses: which reply answers which request, whose loss a missing one is, who is accused."""
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +13,7 @@ from tests.kit.made_logs import PLAN, Wire
 from bench import fuzz_pairing
 from dxlrun.channels.logged_packets import LoggedPacket
 from dxlrun.log.columns import PacketColumns
+from dxlrun_analysis.counts import Counts
 from dxlrun_analysis.finding import Finding
 from dxlrun_analysis.plan_excerpt import LoggedBus
 from dxlrun_analysis.report import analyze_log
@@ -108,6 +110,19 @@ def test_the_block_of_a_fast_status_that_comes_by_itself_is_late_and_breaks_no_o
 def test_any_packets_are_paired():
     _, missing = fuzz_pairing.campaign(100, seed=7)
     assert missing > 100
+
+
+def test_values_are_counted_by_group():
+    rng, counts, known = np.random.default_rng(3), Counts(), Counter()
+    for groups, spread in ((1, 3), (7000, 1 << 20), (2, 1 << 62), (3, 5000)):
+        group, value = rng.integers(-1, groups, 4000), rng.integers(-spread, spread, 4000)
+        counts.count_values(group, value)
+        known.update(zip(group.tolist(), np.clip(value, -(1 << 39), (1 << 39) - 1).tolist(), strict=True))
+    assert counts.groups == sorted({group for group, _ in known if group >= 0})
+    for group in range(100):
+        found = dict(zip(*(column.tolist() for column in counts.counts_of(group)), strict=True))
+        assert found == {value: times for (one, value), times in known.items() if one == group}
+        assert list(found) == sorted(found)
 
 
 def test_packets_outside_of_their_bytes_are_refused():

@@ -47,14 +47,13 @@ class BrokenReplies:
         cut = servo[ends & exchanges.requests.fast[request]]
         self._broken += np.bincount(servo, minlength=buses * IDS)
         self._cut += np.bincount(cut, minlength=buses * IDS)
-        self._noisy += np.bincount(exchanges.bus[(exchanges.noise > 0) & exchanges.ended], minlength=buses)
+        noisy = np.flatnonzero(exchanges.noise > 0)
+        self._noisy += np.bincount(exchanges.bus[noisy[exchanges.ended[noisy]]], minlength=buses)
         # In an incomplete fast status packet, stray bytes are cut blocks.
-        incomplete = np.zeros(len(exchanges.request), np.bool_)
-        incomplete[due.exchange[due.missing]] = True
-        cut_blocks = exchanges.requests.fast[exchanges.request] & incomplete
-        disturbed = (exchanges.noise > 0) & ~cut_blocks
+        incomplete = np.isin(noisy, due.exchange[due.missing])
+        disturbed = noisy[~(exchanges.requests.fast[exchanges.request[noisy]] & incomplete)]
         self._disturbed += np.bincount(exchanges.bus[disturbed], minlength=buses)
-        self._asked += np.bincount(exchanges.bus[exchanges.request > 0], minlength=buses)
+        self._asked += exchanges.times[:, 1:].sum(axis=1)
 
     def findings(self, index: int, bus: LoggedBus, losses: Mapping[int, ServoLosses]) -> Sequence[Finding]:
         """Report the one servo of a bus whose replies are broken, or else noise on the bus."""

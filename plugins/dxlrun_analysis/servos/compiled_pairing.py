@@ -37,6 +37,8 @@ class ExchangeColumns(NamedTuple):
     last_ns: Numbers
     noise: Numbers
     answer: Numbers
+    kind: Numbers
+    extra_ns: Numbers
     row: Numbers  # Row of the instruction in the packets; -1 without one
     asked_id: Numbers  # ID in the instruction; -1: any servo may answer, or no instruction
 
@@ -50,13 +52,14 @@ class Replies(NamedTuple):
     place: Numbers  # Place in the replies that the instruction requests; -1: not requested
     took_us: Numbers
     """From before the write() of the instruction to `last_ns`; 0 for a reply that does not answer."""
-    wire_ns: Numbers  # Wire time of the status packet
+    own_ns: Numbers
+    """From the end of the preceding status packet in the exchange (for the first, of the instruction) to
+    `last_ns`, less the wire time of the status packet."""
     last_ns: Numbers  # After the read() of the status packet's last byte
-    before_ns: Numbers
-    """`last_ns` of the preceding status packet in the exchange; for the first, end of the instruction."""
     due_ns: Numbers
     """Planned time of the reply's last byte, from the end of the instruction, and wire time and return
     delay of this and the preceding replies."""
+    kind: Numbers  # A `ReplyKind`
     answers: Flags  # True: requested, in time, and the first reply of the servo in the exchange
     strange: Flags  # True: a complete status packet of one servo that the exchange does not request
 
@@ -135,7 +138,7 @@ class CompiledPairing:
         return _STRUCTS[name](**{key: one.ctypes.data for key, one in columns.items()}, **numbers)
 
     def split_packets(self) -> tuple[ExchangeColumns, Numbers]:
-        """Return the exchanges, without `last_ns` and `answer`, and the exchange of each packet.
+        """Return the exchanges, without what `pair_replies` sets, and the exchange of each packet.
 
         A request of several servos is -1 minus the index of an exchange with the same instruction.
 
@@ -157,7 +160,8 @@ class CompiledPairing:
     def pair_replies(
         self, exchanges: ExchangeColumns, exchange: Numbers, requests: DistinctRequests
     ) -> tuple[Replies, DueReplies]:
-        """Return the replies and the requested replies; set `last_ns` and `answer` of the exchanges.
+        """Return the replies and the requested replies; set `last_ns`, `answer`, `kind` and `extra_ns`
+        of the exchanges.
 
         Args:
             exchanges: The exchanges, with rows of `requests` as requests.
@@ -165,7 +169,7 @@ class CompiledPairing:
             requests: The requests.
         """
         library, tables = _library(), requests._asdict()
-        names = ("servos", "places", "ids", "begins", "blocks", "block_ends")
+        names = ("servos", "places", "ids", "begins", "blocks", "block_ends", "fast")
         table = self._structure(
             "Requests", {name: tables[name] for name in names}, widest=requests.blocks.shape[1]
         )

@@ -51,6 +51,10 @@ class Exchanges(NamedTuple):
     after the end of the log."""
     noise: Numbers  # Bytes that belong to no intact packet
     answer: Numbers  # Index in `replies` of the last one that was requested; -1: none
+    kind: Numbers  # A `ReplyKind`, of the first reply
+    extra_ns: Numbers
+    """Time of the last reply beyond wire time and return delay; the smallest integer if one is missing."""
+    times: Numbers  # Number of exchanges on each bus with each request, shape (buses, requests)
     replies: Replies
     due: DueReplies
     late: LateReplies
@@ -60,30 +64,48 @@ class Exchanges(NamedTuple):
     stray: PacketColumns  # Bytes that belong to no intact packet
 
     def complete(self) -> tuple[Numbers, Numbers]:
-        """Return the rows of the exchanges that all servos answered, and the time of their last reply beyond
-        wire time and return delay, ns."""
-        whole = self.requests.servos[self.request] > 0
-        whole[self.due.exchange[self.due.missing]] = False
-        rows = np.flatnonzero(whole)
-        last = self.answer[rows]
-        return rows, self.replies.last_ns[last] - self.replies.due_ns[last]
+        """Return the rows of the exchanges that all servos answered, and their `extra_ns`."""
+        rows = np.flatnonzero(self.extra_ns > np.iinfo(np.int64).min)
+        return rows, self.extra_ns[rows]
 
     def first_servos(self, rows: Numbers) -> Numbers:
         """Return the servo that each of the exchanges in `rows` asks first; each asks at least one."""
         begins = self.requests.begins[self.request[rows]]
         return self.bus[rows] * IDS + self.requests.ids[begins]
 
-    def count_due(self, rows: Numbers) -> Numbers:
-        """Return how often the exchanges in `rows` ask each servo, shape (buses times 256,)."""
-        requests, kinds = self.requests, len(self.requests.servos)
-        count = np.zeros(len(self.buses) * IDS, np.int64)
-        # A log has few distinct requests, and many exchanges with each.
-        times = np.bincount(self.bus[rows] * kinds + self.request[rows])
-        for key in np.flatnonzero(times).tolist():
-            bus, request = divmod(key, kinds)
+    def ended_times(self) -> Numbers:
+        """Return `times` of the exchanges that have ended."""
+        rows, times = np.flatnonzero(~self.ended), self.times.copy()
+        np.subtract.at(times, (self.bus[rows], self.request[rows]), 1)
+        return times
+
+    def count_due(self, times: Numbers) -> Numbers:
+        """Return how often exchanges ask each servo, shape (buses times 256,), by their number `times`."""
+        requests, count = self.requests, np.zeros(len(self.buses) * IDS, np.int64)
+        for bus, request in np.argwhere(times).tolist():
             begin = requests.begins[request]
-            count[bus * IDS + requests.ids[begin : begin + requests.servos[request]]] += times[key]
+            ids = requests.ids[begin : begin + requests.servos[request]]
+            count[bus * IDS + ids] += times[bus, request]
         return count
+
+    def count_first(self, times: Numbers, *, alone: bool) -> Numbers:
+        """Return how often exchanges ask each servo first of several, or `alone`; by their number `times`."""
+        requests, count = self.requests, np.zeros(len(self.buses) * IDS, np.int64)
+        which = requests.servos == 1 if alone else requests.servos > 1
+        bus, request = np.nonzero(times * which)
+        np.add.at(count, bus * IDS + requests.ids[requests.begins[request]], times[bus, request])
+        return count
+
+
+@unique
+class ReplyKind(IntEnum):
+    """Kind of a reply by which its own time is compared, if it is known."""
+
+    NONE = -1  # Unknown: shared or delivered together with a neighbour, or not in its turn
+    CHAINED = 0  # After others in a chain
+    FIRST = 1  # First of a chain or of a cycle; not compared
+    RESTED = 2  # Asked alone after a rest of the line
+    NEXT = 3  # Asked alone right after an exchange
 
 
 @unique
@@ -199,13 +221,15 @@ class Pairing:
         others = np.flatnonzero(kind == PacketKind.OTHER_HOST)
         back = _came_back(packets, rows[others], columns, exchange[others])
         echoes = columns.bus[exchange[np.append(others[back], np.flatnonzero(kind == PacketKind.ECHO))]]
+        kinds = len(self._requests.all.servos)
+        times = np.bincount(columns.bus * kinds + columns.request, minlength=buses * kinds)
         return Exchanges(
             self.buses,
             self._requests.all,
             *columns[:7],
             ended,
-            columns.noise,
-            columns.answer,
+            *columns[7:11],
+            times.reshape(buses, kinds),
             replies,
             due,
             late,

@@ -2,26 +2,32 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
+from functools import cache
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun import LINEAR, Floats, Log
+from dxlrun.tooling.compiled_code import load_compiled, parse_structs
 from dxlrun.tooling.records import OFFLINE
 from dxlrun_analysis.plan_excerpt import LoggedPlan
 
 Numbers = NDArray[np.int64]
 
+SOURCE = Path(__file__).with_name("joint_states.c")
+_STRUCTS = parse_structs(SOURCE.read_text())
 _IDS = 256
 BINS = 200  # Angles of -500 to 500 deg, speeds to 20 rad/s, temperatures to 200 deg C
 QUANTITIES = ANGLE, SPEED, TEMPERATURE = range(3)
 _STEPS = np.array([math.radians(5), 0.1, 1.0])  # rad, rad/s, deg C: width of a bin
-_FIRST = np.array([-BINS // 2, 0, 0])  # Lower edge of the first bin, in bin widths
+_FIRST = np.array([-BINS / 2, 0, 0])  # Lower edge of the first bin, in bin widths
 _MOST_HELD = 200_000  # Cycles that wait for their exchanges; in a complete log they cover 20 s
+_USABLE = ~np.isin(np.arange(256), OFFLINE)  # By the value of `torque`
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +74,7 @@ class JointStates:
         angle, heat = (np.array(cycles[name].T, order="C") for name in ("position", "temperature"))
         angle /= self.share[:, None]
         angle[~cycles["valid"].T] = np.nan
-        usable = ~np.isin(cycles["torque"].T, OFFLINE)
+        usable = _USABLE[np.array(cycles["torque"].T, order="C")]
         self._held.append((cycles["cycle"].copy(), cycles["period_ns"].copy(), angle, usable, heat))
         while len(self._held) > 1 and sum(len(part[0]) for part in self._held) > _MOST_HELD:
             self._held.pop(0)
@@ -82,26 +88,19 @@ class JointStates:
             np.concatenate(part, axis=-1) for part in zip(*self._held, strict=True)
         )
         end = len(numbers) if everything else int(np.searchsorted(numbers, cycle, side="right"))
-        for row, mine in enumerate(angle):
-            known = np.isfinite(mine)
-            if known.any() and not known.all():
-                angle[row] = np.interp(numbers, numbers[known], mine[known])
+        bins = np.empty((len(QUANTITIES), len(angle), end), np.int16)
+        states = {"cycle": numbers, "period_ns": period_ns, "angle": angle, "heat": heat, "usable": usable}
+        table = {"step": _STEPS, "first": _FIRST, "at": bins, "time_ns": self.time_ns}
+        size = {"until": end, "quantities": len(QUANTITIES), "bins": BINS}
+        structures = (
+            _STRUCTS[name](**{key: one.ctypes.data for key, one in columns.items()}, **counts)
+            for name, columns, counts in (
+                ("States", states, {"count": len(numbers), "joints": len(angle)}),
+                ("Bins", table, size),
+            )
+        )
+        _library().joint_states_bin(*map(ctypes.byref, structures))
         self._held = [(numbers[end:], period_ns[end:], angle[:, end:], usable[:, end:], heat[:, end:])]
-        speeds, joints = _speeds(numbers, period_ns, angle), len(angle)
-        rows = len(QUANTITIES) * joints
-        bins = np.empty((len(QUANTITIES), joints, end), np.int16)
-        for quantity, values in enumerate((angle[:, :end], speeds[:, :end], heat[:, :end])):
-            known = np.isfinite(values) & usable[:, :end]
-            steps = np.floor(values / _STEPS[quantity])
-            steps -= _FIRST[quantity]
-            bins[quantity] = np.where(known, np.clip(steps, 0, BINS - 1, out=steps), -1)
-        # Bin -1 is counted, too, and dropped.
-        index = bins + ((BINS + 1) * np.arange(rows) + 1).reshape(len(QUANTITIES), joints, 1)
-        changes = np.flatnonzero(np.diff(period_ns[:end], prepend=-1)).tolist()
-        for begin, until in pairwise([*changes, end]):
-            cycles = np.bincount(index[..., begin:until].ravel(), minlength=rows * (BINS + 1))
-            cycles = cycles.reshape(len(QUANTITIES), joints, BINS + 1)[..., 1:]
-            self.time_ns += cycles.swapaxes(0, 1) * period_ns[begin]
         return Places(numbers[:end], bins)
 
     def range_text(self, joint: int, quantity: int, low: int, high: int) -> str:
@@ -116,11 +115,8 @@ class JointStates:
         return f"between {begin * factor:.0f} and {end * factor:.0f} {unit}"
 
 
-def _speeds(numbers: Numbers, period_ns: Numbers, angle: Floats) -> Floats:
-    """Return the speed of each joint in each cycle, from its angles in the two neighbouring cycles, rad/s,
-    shape (joints, cycles)."""
-    found = np.full(angle.shape, np.nan)
-    if len(numbers) > 2:
-        took_s = np.maximum((numbers[2:] - numbers[:-2]) * period_ns[1:-1] * 1e-9, 1e-9)
-        found[:, 1:-1] = np.abs(angle[:, 2:] - angle[:, :-2]) / took_s
+@cache
+def _library() -> ctypes.CDLL:
+    found = load_compiled(SOURCE, ctypes.CDLL)
+    found.joint_states_bin.argtypes, found.joint_states_bin.restype = (ctypes.c_void_p,) * 2, None
     return found

@@ -104,26 +104,26 @@ class Losses:
     def add_exchanges(self, exchanges: Exchanges, places: Places) -> None:
         """Add the missing replies of some exchanges; `places` has the joint states in their cycles."""
         due, ended, exchange = exchanges.due, exchanges.ended, exchanges.due.exchange
-        count, missing = exchanges.requests.servos[exchanges.request], due.missing
-        cycles = _moments(exchanges)
+        servos, missing = exchanges.requests.servos, due.missing
         lost = missing[due.loss[missing] != Loss.LATE]
         rows = lost[ended[exchange[lost]]]
+        cycles, asks = _moments(exchanges, exchange[rows]), servos[exchanges.request[exchange[rows]]]
         own = due.loss[rows] == Loss.OWN
         nothing = (due.loss[rows] == Loss.LINE) & (due.place[rows] == 0)
         # A servo could have answered if no reply before its own was missing.
-        first = np.full(len(count), IDS, np.int64)
-        first[exchange[rows[own | nothing]]] = due.place[rows[own | nothing]]
-        behind = np.flatnonzero((first < IDS)[exchange])
-        behind = behind[(due.reply[behind] >= 0) & (due.place[behind] > first[exchange[behind]])]
+        first = own | nothing
+        rest = (asks - due.place[rows] - 1)[first]
+        behind = np.repeat(rows[first] + 1 - np.cumsum(rest) + rest, rest) + np.arange(rest.sum())
+        behind = behind[due.reply[behind] >= 0]
         closed = missing[ended[exchange[missing]]]
-        everything = exchanges.count_due(np.arange(len(count)))
-        self._asked += everything - exchanges.count_due(np.flatnonzero(~ended))
+        everything, times = exchanges.count_due(exchanges.times), exchanges.ended_times()
+        self._asked += exchanges.count_due(times)
         self._asked -= np.bincount(due.servo[np.append(closed, behind)], minlength=len(self._asked))
+        self._chains += exchanges.count_first(times, alone=False)
+        self._alone += exchanges.count_first(times, alone=True)
         for counts, servo in (
-            (self._chains, exchanges.first_servos(np.flatnonzero(ended & (count > 1)))),
             (self._broken_off, due.servo[rows[nothing]]),
-            (self._alone, exchanges.first_servos(np.flatnonzero(ended & (count == 1)))),
-            (self._lost_alone, due.servo[rows[own & (count[exchange[rows]] == 1)]]),
+            (self._lost_alone, due.servo[rows[own & (asks == 1)]]),
             (self._asked, due.servo[rows[own]]),
             (self._lost, due.servo[rows[own]]),
         ):
@@ -137,11 +137,10 @@ class Losses:
         self._answers += came.reshape(-1, IDS).sum(axis=1)
         joint = self._states.joint_of[due.servo[rows]]
         at = np.searchsorted(places.cycle, exchanges.cycle[exchange[rows]])
-        columns = (rows, own, nothing, joint, at, answers, answered)
+        columns = (rows, cycles, own, nothing, joint, at, answers, answered)
         missed = zip(*(column.tolist() for column in columns), strict=True)
-        for row, is_own, whole, of, place, seen, now in missed:
+        for row, cycle, is_own, whole, of, place, seen, now in missed:
             servo, at_ns = int(due.servo[row]), int(exchanges.asked_ns[exchange[row]])
-            cycle = int(cycles[exchange[row]])
             out = self._open.get(servo)
             if out is not None and out.answered == now:
                 if at_ns - out.at_ns <= _APART_NS:
@@ -157,7 +156,7 @@ class Losses:
         """Add exchanges with late replies: rows and bus of each; several in one cycle count once."""
         if len(self._answers) < 2:
             return
-        cycles = _moments(exchanges)[rows]
+        cycles = _moments(exchanges, rows)
         _, first = np.unique(np.stack([bus, cycles]), axis=1, return_index=True)
         for row in first.tolist()[: _MOST_KEPT - len(self._late)]:
             cycle, at_ns = int(cycles[row]), int(exchanges.asked_ns[rows[row]])
@@ -386,10 +385,10 @@ def narrowest(time: Numbers, begun: Numbers, *, open_above: bool) -> tuple[int, 
     return int(low[best]), int(high[best]), count, part
 
 
-def _moments(exchanges: Exchanges) -> Numbers:
-    """Return the cycle of each exchange; before the first cycle, a distinct number for each 10 ms."""
-    before = exchanges.asked_ns // _UNKNOWN_NS - (1 << 60)
-    return np.where(exchanges.cycle > BEFORE_FIRST_CYCLE, exchanges.cycle, before)
+def _moments(exchanges: Exchanges, rows: Numbers) -> Numbers:
+    """Return the cycle of some exchanges; before the first cycle, a distinct number for each 10 ms."""
+    cycle, before = exchanges.cycle[rows], exchanges.asked_ns[rows] // _UNKNOWN_NS - (1 << 60)
+    return np.where(cycle > BEFORE_FIRST_CYCLE, cycle, before)
 
 
 def _before(rows: Numbers, servo: Numbers, width: int, lost: Numbers, so_far: Numbers) -> Numbers:

@@ -63,9 +63,10 @@ class OtherHosts:
             (self._stray, stray.bus),
             (self._lost, due.servo[due.missing[np.isin(due.loss[due.missing], _LOST)]] // IDS),
             (self._echoes, exchanges.echoes),
-            (self._asked, exchanges.bus[exchanges.asked_ns > 0]),
         ):
             np.add(counts, np.bincount(buses, minlength=len(counts)), out=counts)
+        # The first exchange of each bus has no instruction.
+        self._asked += exchanges.times.sum(axis=1) - 1
 
     def _of(self, index: int) -> tuple[Numbers, Numbers]:
         """Return the foreign instructions on a bus: code times 256 plus ID of each kind, and its count."""

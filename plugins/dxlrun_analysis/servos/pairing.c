@@ -17,11 +17,13 @@
 #define BROADCAST_ID 254
 #define BYTE_NS 10000000000 /* wire time of a byte times the rate in bit/s: ten bits a byte */
 #define RECENT 16           /* requests with which another one is compared: a robot has few */
+#define REST_NS 1000000     /* a longer pause of the line is a rest */
 #define HEADER_2 0x00fdffff /* first four bytes of Protocol 2.0; no packet of Protocol 1.0 has length 0 */
 
 enum { INSTRUCTION = 1, STATUS = 2, NOISE = 3, LATE = 4 }; /* packets.py */
 enum { PING = 1, READ = 2, SYNC_READ = 0x82, FAST_SYNC_READ = 0x8A, BULK_READ = 0x92, FAST_BULK_READ = 0x9A };
-enum { NONE = -1, OWN = 0, BEHIND = 1, LINE = 2 }; /* exchanges.py: Loss */
+enum { NONE = -1, OWN = 0, BEHIND = 1, LINE = 2 };                  /* exchanges.py: Loss */
+enum { NO_KIND = -1, CHAINED, FIRST, RESTED, NEXT };                /* exchanges.py: ReplyKind */
 
 typedef struct {
     const int64_t *rows; /* rows of the packets in the columns, by bus, then by time */
@@ -38,19 +40,20 @@ typedef struct {
 
 typedef struct { /* columns of `DistinctRequests` */
     const int64_t *servos, *places, *ids, *begins, *blocks, *block_ends;
+    const uint8_t *fast;
     int64_t widest; /* columns of `blocks` and `block_ends` */
 } Requests;
 
 typedef struct { /* columns of `Exchanges`, and: */
     int64_t *bus, *cycle, *request, *asked_ns, *blocked_ns, *sent_ns, *last_ns, *noise;
-    int64_t *answer;
+    int64_t *answer, *kind, *extra_ns;
     int64_t *row;      /* row of the instruction; -1 without one */
     int64_t *asked_id; /* ID in the instruction; -1: any servo may answer, or no instruction */
     int64_t count;
 } Exchanges;
 
 typedef struct { /* columns of `Replies` */
-    int64_t *exchange, *servo, *place, *took_us, *wire_ns, *last_ns, *before_ns, *due_ns;
+    int64_t *exchange, *servo, *place, *took_us, *own_ns, *last_ns, *due_ns, *kind;
     uint8_t *answers, *strange;
 } Replies;
 
@@ -210,6 +213,17 @@ static int64_t blocks_of(const Packets *packets, const Requests *requests, int64
     return count;
 }
 
+/* Return the kind of an exchange's first reply; `before` is the exchange before on any bus, -1 without one. */
+static int64_t first_kind(const Exchanges *exchanges, const Requests *requests, int64_t at, int64_t before)
+{
+    int64_t request = exchanges->request[at];
+    if (requests->fast[request] || requests->servos[request] != 1 || before < 0 ||
+        exchanges->cycle[at] != exchanges->cycle[before]) {
+        return FIRST;
+    }
+    return minus(exchanges->asked_ns[at], exchanges->last_ns[before]) > REST_NS ? RESTED : NEXT;
+}
+
 /* Return the number of replies in the packets. */
 int64_t pairing_count_replies(
     const Packets *packets, const Requests *requests, const Exchanges *exchanges, const int64_t *exchange)
@@ -225,7 +239,8 @@ int64_t pairing_count_replies(
     return found;
 }
 
-/* Fill in the replies, the requested replies, `last_ns` and `answer` of the exchanges. Return the number of missing replies. */
+/* Fill in the replies, the requested replies, and `last_ns`, `answer`, `kind` and `extra_ns` of the exchanges. Return
+ * the number of missing replies. */
 int64_t pairing_pair_replies(const Packets *packets, const Buses *buses, const Requests *requests,
     const Exchanges *exchanges, const int64_t *exchange, const Replies *replies, const DueReplies *due,
     const TrafficCounts *counts)
@@ -233,8 +248,8 @@ int64_t pairing_pair_replies(const Packets *packets, const Buses *buses, const R
     int64_t next = 0, reply = 0, begin = 0, lacking = 0;
     for (int64_t at = 0; at < exchanges->count; at++) {
         int64_t request = exchanges->request[at], bus = exchanges->bus[at], servos = requests->servos[request];
-        exchanges->answer[at] = -1;
-        int64_t due_ns = exchanges->sent_ns[at], before_ns = due_ns, last_ns = due_ns, missing = servos;
+        exchanges->answer[at] = -1, exchanges->kind[at] = first_kind(exchanges, requests, at, at - 1);
+        int64_t due_ns = exchanges->sent_ns[at], before_ns = due_ns, last_ns = due_ns, missing = servos, first = reply;
         for (int64_t place = 0; place < servos; place++) {
             due->exchange[begin + place] = at, due->place[begin + place] = place;
             due->servo[begin + place] = bus * IDS + requests->ids[requests->begins[request] + place];
@@ -257,9 +272,9 @@ int64_t pairing_pair_replies(const Packets *packets, const Buses *buses, const R
                 }
                 int64_t place = requests->places[request * IDS + servo_id], servo = bus * IDS + servo_id;
                 replies->exchange[reply] = at, replies->servo[reply] = servo;
-                replies->place[reply] = place, replies->wire_ns[reply] = wire, replies->took_us[reply] = 0;
-                replies->last_ns[reply] = packets->last_ns[row], replies->before_ns[reply] = before_ns;
-                replies->due_ns[reply] = due_ns;
+                replies->place[reply] = place, replies->took_us[reply] = 0, replies->due_ns[reply] = due_ns;
+                replies->last_ns[reply] = packets->last_ns[row];
+                replies->own_ns[reply] = minus(minus(packets->last_ns[row], before_ns), wire);
                 replies->strange[reply] = place < 0 && in_time && blocks < 0;
                 /* The first of several replies of a servo counts. */
                 int answers = place >= 0 && in_time && due->reply[begin + place] < 0;
@@ -274,11 +289,22 @@ int64_t pairing_pair_replies(const Packets *packets, const Buses *buses, const R
                     replies->took_us[reply] = took_ns / 1000 - (took_ns % 1000 < 0);
                     due->reply[begin + place] = exchanges->answer[at] = reply, missing--;
                 }
+                /* A reply that took less than half its wire time was delivered together with the preceding one. */
+                int together = reply > first && replies->own_ns[reply] < -(wire / 2);
+                int in_turn = answers && place == reply - first && !requests->fast[request] && !together;
+                replies->kind[reply] = !in_turn ? NO_KIND : reply > first ? CHAINED : exchanges->kind[at];
+                if (together) {
+                    replies->kind[reply - 1] = NO_KIND;
+                }
                 last_ns = larger(last_ns, packets->last_ns[row]);
             }
             before_ns = packets->last_ns[row];
         }
-        exchanges->last_ns[at] = last_ns;
+        exchanges->last_ns[at] = last_ns, exchanges->extra_ns[at] = INT64_MIN;
+        if (servos > 0 && missing == 0) {
+            int64_t answer = exchanges->answer[at];
+            exchanges->extra_ns[at] = minus(replies->last_ns[answer], replies->due_ns[answer]);
+        }
         /* Only the first missing reply is the servo's own: the next ones wait for it in vain. */
         int64_t loss = missing == servos && servos > 1 ? LINE : OWN;
         for (int64_t one = begin; one < begin + servos; one++) {

@@ -26,15 +26,12 @@ from dxlrun.tooling.output import counted, late_replies
 from dxlrun_analysis.counts import Counts, median, quantile
 from dxlrun_analysis.finding import Finding, cause
 from dxlrun_analysis.plan_excerpt import LoggedBus
-from dxlrun_analysis.servos.exchanges import Exchanges
+from dxlrun_analysis.servos.exchanges import Exchanges, ReplyKind
 from dxlrun_analysis.servos.logged_requests import IDS, Flags, Numbers
 from dxlrun_analysis.servos.losses import Losses
 from dxlwire import BROADCAST_ID
 
-_KINDS = _CHAINED, _FIRST, _RESTED, _NEXT = range(4)
-"""Kinds of replies: after others in a chain; first of a chain or of a cycle, not compared; asked alone after
-a rest of the line; asked alone right after an exchange."""
-_REST_NS = 1_000_000  # A longer pause of the line is a rest
+_KINDS = len(ReplyKind) - 1  # Without NONE
 _FEWEST = 20  # Replies from which a servo or a bus is judged
 _ODD_US = 100  # Threshold for a servo: clocks of servos and hosts differ by some 10 us [i]
 _MOST = 0.75  # Share of the replies that must be later
@@ -70,26 +67,11 @@ class ReplyTimes:
             complete: The complete ones among them, and their delay: `exchanges.complete()`.
             losses: Receives the late exchanges.
         """
-        replies, late = exchanges.replies, exchanges.late
-        requests = exchanges.requests
-        self._exchanges += np.bincount(
-            exchanges.bus[requests.servos[exchanges.request] > 0], minlength=len(self._exchanges)
-        )
-        asked = np.where(requests.fast, 0, requests.servos)[exchanges.request]
-        rows = np.flatnonzero((asked > 0)[replies.exchange])
-        of, count, wire_ns = replies.exchange[rows], len(rows), replies.wire_ns[rows]
-        first = np.flatnonzero(np.diff(of, prepend=-1))
-        number = np.arange(count) - np.repeat(first, np.diff(np.append(first, count)))
-        own_ns = replies.last_ns[rows] - replies.before_ns[rows] - wire_ns
-        kinds = np.where(asked == 1, np.where(_rested(exchanges), _RESTED, _NEXT), _FIRST)
-        kinds[np.diff(exchanges.cycle, prepend=-2) != 0] = _FIRST
-        # A reply that took less than half its wire time was delivered together with the preceding one.
-        together = (number > 0) & (own_ns < -(wire_ns // 2))
-        followed = np.append(together[1:], False) if count else together
-        in_turn = replies.answers[rows] & (replies.place[rows] == number)
-        known = np.flatnonzero(in_turn & ~together & ~followed)
-        kind = np.where(number[known] == 0, kinds[of[known]], _CHAINED)
-        self._own_us.count_values(replies.servo[rows[known]] * len(_KINDS) + kind, own_ns[known] // 1000)
+        replies, late, requests = exchanges.replies, exchanges.late, exchanges.requests
+        self._exchanges += exchanges.times[:, requests.servos > 0].sum(axis=1)
+        rows = np.flatnonzero(replies.kind != ReplyKind.NONE)
+        own_us = replies.own_ns[rows] // 1000
+        self._own_us.count_values(replies.servo[rows] * _KINDS + replies.kind[rows], own_us)
         # Replies that were given up count from the end of the preceding reply.
         rows = np.flatnonzero((late.exchange >= 0) & ~_in_time(exchanges))
         of, servo = late.exchange[rows], late.servo[rows]
@@ -99,9 +81,9 @@ class ReplyTimes:
             np.maximum.at(begun_ns, replies.exchange[replies.answers], replies.last_ns[replies.answers])
         behind = requests.places[exchanges.request[of], servo % IDS] > 0
         alone = np.flatnonzero(servo % IDS != BROADCAST_ID)
-        kind = np.where(behind, _CHAINED, kinds[of])[alone]
+        kind = np.where(behind, ReplyKind.CHAINED, exchanges.kind[of])[alone]
         own_us = (late.at_ns[rows] - begun_ns[of])[alone] // 1000
-        self._own_us.count_values(servo[alone] * len(_KINDS) + kind, own_us)
+        self._own_us.count_values(servo[alone] * _KINDS + kind, own_us)
         self._take_late(exchanges, complete, (of, servo, late.late_ns[rows]), losses)
 
     def _take_late(
@@ -119,31 +101,28 @@ class ReplyTimes:
             given_up: Exchange, servo and lateness (ns) of each late reply that was given up.
             losses: Receives the late exchanges.
         """
-        replies, count = exchanges.replies, len(exchanges.request)
-        due = exchanges.requests.servos[exchanges.request]
+        replies = exchanges.replies
         whole, extra_ns = complete
         # Without a rate, the due time is unknown.
         limits = [bus.latency_ns + _LATE_NS if bus.baud_rate > 0 else _NEVER_NS for bus in exchanges.buses]
         late = extra_ns >= np.array(limits, np.int64)[exchanges.bus[whole]]
         whole, extra_ns = whole[late], extra_ns[late]
-        is_late = np.zeros(count, np.bool_)
-        is_late[whole] = True
-        answers = np.flatnonzero(replies.answers & is_late[replies.exchange])
-        of = replies.exchange[answers]
-        own_ns = replies.last_ns[answers] - replies.before_ns[answers] - replies.wire_ns[answers]
-        order = np.lexsort((own_ns, of))
-        slowest = np.full(count, -1, np.int64)
-        slowest[of[order]] = answers[order]
+        answers = np.flatnonzero(replies.answers & np.isin(replies.exchange, whole))
+        # Of equal exchanges, the last counts: the one with the slowest reply.
+        of, order = (
+            replies.exchange[answers],
+            np.lexsort((replies.own_ns[answers], replies.exchange[answers])),
+        )
+        slowest = answers[order][np.searchsorted(of, whole, side="right") - 1]
         lacks, first = np.unique(given_up[0], return_index=True)
         rows = np.append(whole, lacks)
         # Any servo of a fast status packet can be late.
         fast = exchanges.requests.fast[exchanges.request[whole]]
         of_any = exchanges.bus[whole] * IDS + BROADCAST_ID
-        servo = np.append(np.where(fast, of_any, replies.servo[slowest[whole]]), given_up[1][first])
-        single = due == 1
-        for counts, at in ((self._single, np.flatnonzero(single)), (self._single_late, rows[single[rows]])):
-            asked = exchanges.first_servos(at)
-            np.add(counts, np.bincount(asked, minlength=len(counts)), out=counts)
+        servo = np.append(np.where(fast, of_any, replies.servo[slowest]), given_up[1][first])
+        single = rows[exchanges.requests.servos[exchanges.request[rows]] == 1]
+        self._single += exchanges.count_first(exchanges.times, alone=True)
+        self._single_late += np.bincount(exchanges.first_servos(single), minlength=len(self._single))
         self._late_us.count_values(servo, np.append(extra_ns, given_up[2][first]) // 1000)
         losses.late(servo // IDS, exchanges, rows)
 
@@ -164,8 +143,8 @@ class ReplyTimes:
         those that do so at times."""
         samples: dict[int, dict[int, _Values]] = {}
         for group in self._own_us.groups:
-            servo, kind = divmod(group, len(_KINDS))
-            if servo // IDS == index and kind != _FIRST:
+            servo, kind = divmod(group, _KINDS)
+            if servo // IDS == index and kind != ReplyKind.FIRST:
                 samples.setdefault(servo % IDS, {})[kind] = self._own_us.counts_of(group)
         return _slow_servos(bus, samples, now_and_then=now_and_then)
 
@@ -206,13 +185,6 @@ class ReplyTimes:
 
 
 _NOTHING: _Values = (np.zeros(0, np.int64), np.zeros(0, np.int64))
-
-
-def _rested(exchanges: Exchanges) -> Flags:
-    """Return which exchanges follow a rest of the line, shape (exchanges,)."""
-    found = np.ones(len(exchanges.bus), np.bool_)
-    found[1:] = exchanges.asked_ns[1:] - exchanges.last_ns[:-1] > _REST_NS
-    return found
 
 
 def _in_time(exchanges: Exchanges) -> Flags:

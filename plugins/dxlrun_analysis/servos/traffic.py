@@ -162,12 +162,11 @@ class Traffic:
         count, due, replies = len(self._asked), exchanges.due, exchanges.replies
         # A request that is open at the end of the log may have been answered later.
         ended = exchanges.ended[due.exchange[due.missing]]
-        asked = exchanges.count_due(np.arange(len(exchanges.bus)))
+        asked = exchanges.count_due(exchanges.times)
         self._seen |= asked > 0
         self._asked += asked - np.bincount(due.servo[due.missing[~ended]], minlength=count)
         self._lost += np.bincount(due.servo[due.missing[ended]], minlength=count)
-        answers = np.flatnonzero(replies.answers)
-        self._reply_us.count_values(replies.servo[answers], replies.took_us[answers])
+        self._reply_us.count_values(np.where(replies.answers, replies.servo, -1), replies.took_us)
         rows, extra_ns = complete
         self._extra_us.count_values(exchanges.bus[rows], np.maximum(extra_ns, 0) // 1000)
 
