@@ -221,20 +221,6 @@ def judged_off(story, monkeypatch):
     monkeypatch.setattr(Hardware, "read_states", lambda self: None)
 
 
-def test_a_goal_that_is_judged_is_cancelled_by_its_controller_and_the_runtime(story, monkeypatch):
-    judged_off(story, monkeypatch)
-    story.run(20, {2: story.moves(1), 8: story.cancels()})
-    assert story.timed == [(2, "accepted"), (8, "cancelled")]
-    assert story.reports[-1][1].text == "stopped at the end of the motion"
-    assert story.mover.cancelled == [1]
-
-
-def test_a_command_takes_the_place_of_a_goal_that_is_judged(story, monkeypatch):
-    judged_off(story, monkeypatch)
-    story.run(20, {2: story.moves(1), 8: story.posts("arm", "nudge")})
-    assert story.timed == [(2, "accepted"), (8, "preempted")]
-
-
 def test_reached_is_judged_by_what_the_controller_commands(story, monkeypatch):
     """The controller says that it is done; its joint is where it was."""
 
@@ -257,10 +243,3 @@ def test_a_plan_ends_only_when_its_goals_have_settled(story, monkeypatch):
     story.run(end_ns=30 * PERIOD_NS)
     assert story.result.reason == "ended"
     assert story.timed == [(2, "accepted"), (52, "missed")]
-
-
-def test_a_pause_takes_nothing_of_the_settling_time(story, monkeypatch):
-    judged_off(story, monkeypatch)
-    story.run(120, {2: story.moves(1), 20: story.asks("pause"), 50: story.asks("resume")})
-    assert story.timed == [(2, "accepted"), (82, "missed")]
-    assert story.reports[-1][1].text == "after 1.000 s, joint j0 is 8.59 deg off"

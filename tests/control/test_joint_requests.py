@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 from tests.kit.loops import Robot, commanding
 
-from dxlrun.channels.answers import Acceptance, Code, Refusal
+from dxlrun.channels.answers import Code, Refusal
 from dxlrun.channels.cycle import Torque
 from dxlrun.channels.event_records import EventCode
 from dxlrun.plan.policy_plan import SLOW_SPEED
-from dxlwire.modes import Mode
 
 HOLD = commanding(position=0.1)
 SLOW = SLOW_SPEED * 0.02 + 1e-9
@@ -56,47 +55,6 @@ class Story(Robot):
 @pytest.fixture
 def story():
     return Story()
-
-
-def test_a_request_is_answered_when_all_servos_have_answered_by_what_went_wrong(story):
-    answers, why = [], "j1 (ID 2 on bus main) did not confirm torque off; dxlrun sends it again"
-
-    def answer():
-        for place, problem in enumerate(("", why, "")):
-            answers.append(story.inbox.answers[1])
-            story.asked[place][-1](problem)
-
-    story.run(5, {1: story.torques("j0", "j1", "j2", release=True), 3: answer})
-    assert story.what == [(0, False), (1, False), (2, False)]
-    assert answers == [Acceptance(())] * 3
-    assert story.answer() == (Code.TORQUE_NOT_SWITCHED, {"joint": ("j1",), "problem": why})
-
-
-@pytest.mark.parametrize(("row", "request_torque"), [(2, False), (1, True)], ids=["free", "commanded"])
-def test_the_goal_of_a_limp_joint_follows_it_and_its_first_goals_with_torque_are_slow(
-    story, row, request_torque
-):
-    """Moved by hand from 0.25 to 0.9 rad; nothing is said of commands that a limp joint cannot follow."""
-    torque = story.shows(row, torque=Torque.ON, position=0.95)
-    at = {3: story.shows(row, torque=Torque.OFF, position=0.9), 6: torque}
-    at |= {4: story.torques("j1", on=True)} if request_torque else {8: story.switches(["other"])}
-    story.run(12, at)
-    goals = story.goals(row)
-    begun = 6 if request_torque else 8
-    np.testing.assert_allclose(goals[3:begun], [0.9] * 3 + [0.95] * (begun - 6))
-    assert (np.abs(np.diff(goals[begun - 1 :])) < SLOW + (0.05 if request_torque else 0)).all()
-    assert goals[-1] < 0.95
-    assert not any(story.column("clamped", row)[3:6])
-
-
-@pytest.mark.parametrize("mode", [Mode.VELOCITY, Mode.EFFORT, Mode.PWM, Mode.UNKNOWN])
-@pytest.mark.parametrize("release", [False, True])
-@pytest.mark.parametrize("torque", [Torque.OFF, Torque.ON])
-def test_torque_on_deactivates_controllers_of_limp_joints_only_with_release(story, mode, release, torque):
-    shown = story.shows(1, torque=torque, mode=mode)
-    story.run(6, {2: [shown, story.torques("j2", "j1", on=True, release=release)]})
-    assert story.what == [(2, True), (1, True)]
-    assert story.column("active") == [1, 1] + [0 if release and torque is Torque.OFF else 1] * 4
 
 
 def test_joint_that_is_given_torque_holds_where_its_first_reply_finds_it(story):

@@ -46,19 +46,6 @@ def test_the_event_of_a_long_command_shows_only_its_begin(left):
     assert len(text) < 150
 
 
-@pytest.mark.parametrize(
-    ("controller", "kind", "data", "why"),
-    [
-        (LOOP, "switch", b'{"activate": ["\xff"]}', "utf-8"),
-        ("left", "position", b"abc", "3 bytes are not an array"),
-    ],
-)
-def test_what_cannot_be_decoded_is_refused(left, controller, kind, data, why):
-    left.run(3, {1: left.posts(controller, kind, data)})
-    assert left.answer()[0] is Code.INVALID
-    assert why in left.refusals[1].lower()
-
-
 def test_a_fallback_at_the_start_never_takes_a_joint_of_one_that_starts_after_it(robot):
     robot.script("weak", joints=("j0",), fallback="spare")
     robot.script("strong", joints=("j1",)).script("spare", joints=("j1",), **OFF)
@@ -210,30 +197,6 @@ def test_a_motion_file_ends_a_stream(left):
     left.send(2 * PERIOD_NS, "left", "position", 0.5)
     result = left.run(9, {1: left.posts("left", "position", b"", 3 * PERIOD_NS)}, policies=STRICT)
     assert (result.reason, left.events.of(EventCode.STALE_COMMAND)) == ("stopped", [])
-
-
-@pytest.mark.parametrize("breaks", [False, True])
-def test_a_controller_may_hold_by_commands_of_its_own_when_its_stream_ends(robot, breaks):
-    class Holding(Scripted):
-        def on_hold(self, time_ns):
-            assert np.isnan(self.context.commands.position).all(), "it begins without commands"
-            self.context.commands.position[:] = 0.5
-            if breaks:
-                raise RuntimeError("broken")
-
-        def act(self, step, time_ns, value):
-            if step == "command":
-                self.context.commands.position[:] = 0.1
-
-    robot.add("left", Holding)
-    robot.run(8, {1: robot.posts("left", "position", b"", PERIOD_NS), 6: robot.posts("left", "position")})
-    sent = robot.column("position", 0)
-    if breaks:
-        assert (robot.result.reason, len(sent)) == ("fault", 4)
-        assert "raised in on_hold: RuntimeError: broken" in robot.result.detail
-        assert np.isnan(sent[3])
-    else:
-        assert sent[1:] == [0.1] * 2 + [0.5] * 3 + [0.1] * 2
 
 
 # Loading

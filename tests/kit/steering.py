@@ -13,7 +13,8 @@ changes of the robot (`active: false => active: true`), and steps on virtual tim
 
 A line `=>` holds at the end of its step, which is the beginning of the next one; the last step has 0.2 s.
 Requests of a step are separated by `;`, and are done where nothing else is said of them. `ACTIONS` and
-`CHECKS` have all forms. A controller of the type `scripted` commands what is commanded of it, else `own`.
+`CHECKS` have all forms. A controller of the type `scripted` commands what is commanded of it, else `own`;
+one of the type `holding` commands 0.5 when its stream has ended.
 """
 
 import json
@@ -66,12 +67,13 @@ class ScriptedParameters(dxlrun.ParametersModel):
 class Scripted(dxlrun.Controller[ScriptedParameters]):
     """Commands its own value or what is commanded of it; its goal `move` takes so many updates.
 
-    The second value of `move` and `plan` is the number of updates after which it is aborted.
+    The second value of `move` and `plan` is the number of updates after which it is aborted. A goal `aim` is
+    judged by positions that it does not command.
     """
 
     Parameters = ScriptedParameters
-    Commands: ClassVar = {"go": Go, "move": Go, "plan": Go}
-    Goals: ClassVar = frozenset({"move", "plan"})
+    Commands: ClassVar = {"go": Go, "move": Go, "plan": Go, "aim": Go}
+    Goals: ClassVar = frozenset({"move", "plan", "aim"})
     plans: ClassVar = frozenset({"plan"})
     story: ClassVar[Any] = None
 
@@ -105,6 +107,10 @@ class Scripted(dxlrun.Controller[ScriptedParameters]):
         self.own = float(data[0]) if len(data) else self.own
 
     def on_goal(self, goal: Any, data: Any, time_ns: int) -> None:
+        if goal.kind == "aim":
+            self._step("goal")
+            goal.judge(data)
+            return
         self.goal, self.left = goal, int(data[0])
         self.fails = int(data[1]) if len(data) > 1 else -1
         self._step("goal")
@@ -139,6 +145,15 @@ class Scripted(dxlrun.Controller[ScriptedParameters]):
                 self.goal = None
 
 
+class Holding(Scripted):
+    """Holds by a command of its own when its stream ends."""
+
+    def on_hold(self, time_ns: int) -> None:
+        assert np.isnan(self.context.commands.position).all(), "it begins without commands"
+        self._step("hold")
+        self.context.commands.position[:] = self.own = 0.5
+
+
 @dataclass
 class Step:
     """Actions at a time, and the lines of what holds at the end."""
@@ -163,7 +178,7 @@ class Story(VirtualRun):
         self.breaks: dict[tuple[str, str], Callable[[Any], None]] = {}
         self.torque_given: list[str] = []
         self.ending = False
-        plugins = with_scripted(type("OwnScripted", (Scripted,), {"story": self}))
+        plugins = with_scripted(self)
         super().__init__(plan, plugins=plugins, watch=self.see)
         self.door = Preparation({joint.name: joint for joint in plan.loop.joints}, plugins)
         for name, servo in self.servos.items():
@@ -409,6 +424,12 @@ def play(story: Story, text: str) -> None:
     story.asked.append(story.post(CommandMessage(0, LOOP, "play", data, "anna")))
 
 
+def send_bytes(story: Story, controller: str | None, kind: str, data: str) -> None:
+    """Send a command as no gateway does."""
+    message = CommandMessage(0, controller or LOOP, kind, bytes.fromhex(data), "anna")
+    story.asked.append(story.post(message))
+
+
 def command(story: Story, controller: str, kind: str, data: str, seconds: str | None) -> None:
     story.request(kind, controller, float(seconds or 0), **yaml.safe_load(data or "{}"))
 
@@ -433,6 +454,7 @@ ACTIONS: dict[str, Callable[..., None]] = {
     ),
     r"send (\w+) (\w+)(?: (\{.*\}))?(?: for (\S+) s)?": command,
     r"play (.+)": play,
+    r"bytes (?:(\w+) )?(\w+) ([0-9a-f]+)": send_bytes,
     r"(\w+) breaks(?: in (\w+))?": breaking,
     r"(\w+) requests (.+?)( and breaks)?: (.+)": requesting("take_over"),
     r"(\w+) ends the run: (.+)": requesting("end_run"),
@@ -473,10 +495,11 @@ def plain_plugins() -> PlugIns:
     return load_plugins()
 
 
-def with_scripted(controller: type[Scripted]) -> PlugIns:
-    """Return the installed plug-ins and the type `scripted`."""
-    offers = {**plain_plugins().controllers, "scripted": Offer("scripted", controller, "tests 1")}
-    return PlugIns(offers, {}, drivers=plain_plugins().drivers)
+def with_scripted(story: Story | None = None) -> PlugIns:
+    """Return the installed plug-ins and the types `scripted` and `holding`."""
+    own = {one.__name__.lower(): type(one.__name__, (one,), {"story": story}) for one in (Scripted, Holding)}
+    offers = {name: Offer(name, one, "tests 1") for name, one in own.items()}
+    return PlugIns({**plain_plugins().controllers, **offers}, {}, drivers=plain_plugins().drivers)
 
 
 PLANS: dict[str, Plan] = {}
@@ -487,7 +510,7 @@ def compile_story(text: str, folder: Path) -> Plan:
     if text not in PLANS:
         (folder / "robot.yaml").write_text(text)
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(robot_compiler, "load_plugins", lambda **_: with_scripted(Scripted))
+            patch.setattr(robot_compiler, "load_plugins", lambda **_: with_scripted())
             PLANS[text] = plan_of(folder / "robot.yaml")
     return PLANS[text]
 

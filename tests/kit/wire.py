@@ -1,4 +1,4 @@
-"""What is on the wire of a simulated bus, taken apart by code of this file alone, for storms.py.
+"""What is on the wire of a simulated bus, by its ledger, taken apart by code of this file alone.
 
 Addresses and units too are those of FACTS, from the e-Manual, and not the runtime's.
 """
