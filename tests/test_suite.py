@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 import pytest_timeout
+import tests.kit
 from hypothesis import settings
 from tests.kit.awaited import until
 from tests.kit.loaded import loaded
@@ -183,6 +184,11 @@ def unseen_loops(source: str) -> Iterator[str]:
         visit(test.body, None, known, loops)
         if loops and all(loops):
             yield f"{loops[0].lineno} {test.name}"
+
+
+def test_index_of_the_kit_has_each_module() -> None:
+    modules = {path.stem for path in (ROOT / "tests/kit").glob("[a-z]*.py")}
+    assert modules <= {*re.findall(r"\w+", tests.kit.__doc__ or "")}
 
 
 def test_loops_with_assertions_show_that_they_ran() -> None:

@@ -134,17 +134,3 @@ def test_a_run_that_ends_in_a_pause_leaves_the_guardian_its_usual_patience(robot
     robot.hardware.idle = lambda *_: robot.stop.request() if len(robot.sink.cycles) == 3 else None
     robot.loop.run()
     assert robot.patience == [PAUSED_CYCLE_NS, PERIOD_NS]
-
-
-def test_of_two_policies_that_end_a_run_the_first_one_counts(robot):
-    plan = PolicyPlan(of_features={"on_lost_servo": Policy(POSE.steps, "hold"), "on_stale_command": LIMP})
-    robot.build(policies=plan)
-
-    def both(*_):
-        robot.loop._actions.end_run("on_lost_servo", "j0 is lost")
-        robot.loop._actions.end_run("on_stale_command", "the stream ended")
-
-    robot.hardware.idle = both
-    result = robot.loop.run()
-    assert result.detail.startswith("j0 is lost; on_lost_servo: pose home")
-    assert (result.reason, result.last) == ("fault", "hold")

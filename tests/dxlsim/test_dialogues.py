@@ -25,7 +25,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
-from tests.kit.cases import read_cases
+from tests.kit.cases import Line as CaseLine
+from tests.kit.cases import place_of, read_cases
 from tests.kit.line_faults import turn_by_hand
 from tests.kit.simulated_line import Answer, Line, split_statuses
 
@@ -221,15 +222,13 @@ class Dialogue:
 class Case(NamedTuple):
     model: str
     words: list[str]
-    steps: list[tuple[str, str]]
+    steps: list[CaseLine]
 
     def run(self) -> None:
         dialogue = Dialogue(self.model, self.words)
-        for place, step in self.steps:
-            try:
-                dialogue.step(step)
-            except Exception as error:
-                raise AssertionError(f"{place}: {step}: {error}") from error
+        for step in self.steps:
+            with place_of(step):
+                dialogue.step(step.text)
 
 
 def cases() -> Iterator[Any]:
@@ -241,7 +240,7 @@ def cases() -> Iterator[Any]:
         models = [word for word in words if re.search("[A-Z]", word) and "=" not in word]
         words = [word for word in words if word not in (*models, "|")]
         steps = [
-            (line.place, step)
+            CaseLine(line.place, step)
             for line in text.lines
             for step in COMMENT.sub("", line.text).strip().split("; ")
         ]

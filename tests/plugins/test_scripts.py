@@ -30,7 +30,7 @@ import numpy as np
 import pytest
 import yaml
 from msgspec.structs import replace
-from tests.kit.cases import case_parameters
+from tests.kit.cases import case_parameters, fits, place_of
 from tests.kit.stages import Stage
 
 from dxlrun import LINEAR, MotorLoad, MotorModel, ServoModel
@@ -59,11 +59,6 @@ MODELS = {
 
 def parsed(text: str) -> Any:
     return yaml.safe_load(re.sub(r"(?<![\w.\"])(-?)(nan|inf)\b(?! \w)", r"\1.\2", text))
-
-
-def assert_texts(found: str, text: str) -> None:
-    """Compare a text with one that may end with an ellipsis."""
-    assert found.startswith(text[:-3]) if text.endswith("...") else found == text, found
 
 
 def assert_numbers(found: Any, text: str) -> None:
@@ -201,7 +196,8 @@ class Scene:
             ] == rest.split()
         elif word in ("said", "warned", "ends", "takeover"):
             found = self.unexpected[word].pop(0)
-            assert_texts(f"{' '.join(found[0])}: {found[1]}" if word == "takeover" else found, rest)
+            found = f"{' '.join(found[0])}: {found[1]}" if word == "takeover" else found
+            assert fits(found, rest), found
         elif word == "messages":
             assert len(stage.messages) == int(rest)
         elif word == "message":
@@ -222,7 +218,7 @@ class Scene:
         ended, found, of_joint, off = self.stage.goal.ended[0]
         assert ended.name.lower() == outcome, (ended, found)
         if text:
-            assert_texts(found, text)
+            assert fits(found, text), found
         if joint is not None and error is not None:
             assert of_joint == joint
             assert_numbers(off, error)
@@ -236,12 +232,9 @@ class Scene:
 def test_script(case):
     first = parsed(case.head)
     scene = Scene(first["keys"], first.get("with", {}), first.get("before", {}))
-    for place, line, _ in case.lines:
-        try:
-            scene.perform(line)
-        except Exception as error:
-            error.add_note(f"{place}: {line}")
-            raise
+    for line in case.lines:
+        with place_of(line):
+            scene.perform(line.text)
     scene.finish()
 
 
