@@ -7,7 +7,6 @@ from typing import Literal, cast
 
 import dxlrun
 from dxlrun import DxlrunError, GoalState, Refused, RemoteRobot
-from dxlrun.tooling.files import suggestion
 
 Distance = float | str | None
 """Length in m, or as text with its unit: `"5 cm"`. None: not given."""
@@ -54,25 +53,24 @@ class SpaceRobot(RemoteRobot):
             timeout: Longest wait, s; None waits without limit.
 
         Raises:
-            Refused: The pose is malformed (`code` is `invalid`) or out of reach (`goal_refused`), or the
-                motion did not end there (`aborted`, `missed`, `cancelled` or `preempted`).
+            Refused: The arm is unknown, the pose is malformed (`code` is `invalid`) or out of reach
+                (`goal_refused`), or the motion did not end there (`aborted`, `missed`, `cancelled` or
+                `preempted`).
             GoalTimeout: The motion has not ended within `timeout`.
-            DxlrunError: The robot has no arm of this name, or is gone.
+            DxlrunError: The robot has no arm, or several and none is named, or is gone.
         """
         fields = {
             "pose": pose, "x": x, "y": y, "z": z, "dx": dx, "dy": dy, "dz": dz, "rpy": rpy, "drpy": drpy,
             "quaternion": quaternion, "frame": frame, "path": path, "seconds": seconds,
         }  # fmt: skip
         given = {name: value for name, value in fields.items() if value is not None}
-        arms = self._arms()
-        if not arms:
-            fix = "add a `cartesian_controller` to its robot file"
-            raise DxlrunError(f"{self.name} has no arm that moves to poses; {fix}")
-        if arm and arm not in arms:
-            raise DxlrunError(f"{self.name} has no arm {arm}; {suggestion(arm, arms)}")
-        if not arm and len(arms) > 1:
-            raise DxlrunError(f"{self.name} has {len(arms)} arms; name one of {', '.join(arms)}")
-        (goal,) = self.send(arm or arms[0], "pose", given).goals
+        arms = [arm] if arm else self._arms()
+        if len(arms) != 1:
+            fix = (
+                f"name one of {', '.join(arms)}" if arms else "add a `cartesian_controller` to its robot file"
+            )
+            raise DxlrunError(f"{self.name} has {len(arms) or 'no'} arms that move to poses; {fix}")
+        (goal,) = self.send(arms[0], "pose", given).goals
         state = goal.wait(timeout)
         if state.status != "reached":
             raise Refused(state.describe_outcome(), code=state.status, fields={"goal": state.number})

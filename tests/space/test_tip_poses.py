@@ -127,9 +127,14 @@ def test_move_to_waits_for_the_pose_and_raises_what_refused_it(monkeypatch: pyte
             with pytest.raises(Refused, match=text) as refused:
                 robot.move_to(**wrong)
             assert refused.value.code == "invalid"
-        with pytest.raises(DxlrunError, match="has no arm amr; did you mean arm"):
+        with pytest.raises(DxlrunError, match="there is no controller amr; did you mean arm"):
             robot.move_to("amr", dz=0.01)
-    with pytest.raises(DxlrunError, match="bioloid_torso has no arm that moves to poses; add a `cart"):
+        monkeypatch.setattr(robot, "_arms", lambda: ["left", "right"])
+        with pytest.raises(
+            DxlrunError, match="_space has 2 arms that move to poses; name one of left, right"
+        ):
+            robot.move_to(dz=0.01)
+    with pytest.raises(DxlrunError, match="bioloid_torso has no arms that move to poses; add a `cart"):
         robot_of("bioloid_torso", SpaceRobot).move_to(dz=0.01)
 
 
