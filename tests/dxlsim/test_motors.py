@@ -14,11 +14,10 @@ from msgspec import structs
 
 from dxlsim.motion.mechanics import Mechanics
 from dxlsim.motion.motor import motor_of
-from dxlsim.motion.plant import IndependentJoints, PlantJoint
 from dxlsim.motor_model import MotorModel, Stribeck
 from dxlsim.servo.making import make_servo
 from dxlsim.servo.simulated_servo import SimulatedServo
-from dxlsim.simulation_plan import Load, ServoConfig
+from dxlsim.simulation_plan import ServoConfig
 from dxlwire.control_table import all_tables, find_table
 
 S, STEP_NS = 1_000_000_000, 2_000_000
@@ -233,22 +232,6 @@ def test_a_model_is_scaled_from_the_identified_motor_of_its_kind(like, models):
         assert tables
         for table in tables:
             assert motor_of(table).source.startswith(f"[i] scaled from the {like}: "), model
-
-
-@pytest.mark.parametrize(("model", "protocol"), [("MX-64", 1.0), ("MX-106", 1.0), ("XL330-M288", 2.0)])
-def test_simulated_motors_take_up_speed_with_their_own_time_constant(model, protocol):
-    motor = structs.replace(
-        motor_of(find_table(model, protocol)), friction=0.0, load_friction=0.0, viscous_friction=0.0
-    )
-    for load in (Load(), Load(inertia=0.01)):
-        plant = IndependentJoints([PlantJoint(motor, load, 0.0)])
-        dt_s = STEP_NS * 1e-9
-        steps = round(2 * motor.time_constant / dt_s)
-        for _ in range(steps):
-            plant.step_shafts(np.array([motor.stall_torque]), np.array([motor.damping]), dt_s)
-        constant = (motor.inertia + load.inertia) / motor.damping
-        exact = motor.stall_torque / motor.damping * -math.expm1(-steps * dt_s / constant)
-        assert plant.velocity[0] == pytest.approx(exact, rel=0.003)
 
 
 def test_every_model_settles_where_it_should_without_much_overshoot():

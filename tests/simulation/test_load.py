@@ -11,19 +11,15 @@ from tests.kit.awaited import DEADLINE_S
 from tests.kit.bodies import ARM, MASS, PULL, ROTOR, STEP_S, Turned, bodies_of, joint, link, run, urdf
 from tests.kit.bus_process import BusProcess
 from tests.kit.packets import packet2
-from tests.kit.simulated_line import Line
 
 from dxlrun.errors import InputError
 from dxlrun_mujoco.mujoco_plant import mujoco_plant
 from dxlsim.motion.mechanics import Mechanics
-from dxlsim.motion.motor import Motor, motor_of
+from dxlsim.motion.motor import Motor
 from dxlsim.motion.plant import IndependentJoints, Plant, PlantJoint
 from dxlsim.simulation_plan import NO_LOAD, BusConfig, Load, ServoConfig, SimulationConfig
-from dxlwire.control_table import find_table
 
 TICK = math.tau / 4096
-STALL = 4.1
-"""Nm of an XM430-W350 at 12 V (e-Manual, Specifications)"""
 START = 2048
 """Ticks; there the arm is horizontal."""
 
@@ -33,65 +29,6 @@ URDF = f"""<robot name="arm"><link name="base"/>
 <joint name="shoulder" type="continuous"><parent link="base"/><child link="arm"/><axis xyz="0 1 0"/></joint>
 </robot>"""
 """About +y: the arm sinks as its angle grows; the servo, which is mounted the other way round, turns back."""
-
-
-def hang(physics: str) -> Line:
-    """Return a line with one XM430-W350 that holds an arm, limp and horizontal at the start."""
-    if physics == "mujoco":
-        mechanics = Mechanics(0, mujoco_plant(bodies_of(URDF, (Turned("shoulder", START * TICK, -1),))))
-        return Line("XM430-W350", 1, position=START * TICK, mechanics=mechanics)
-    load = Load(inertia=MASS * ARM**2, gravity=PULL, gravity_angle=START * TICK - math.pi / 2)
-    return Line("XM430-W350", 1, position=START * TICK, load=load)
-
-
-def rubbing(torque: float, pull: float) -> float:
-    """Return the friction that holds between the motor's torque and an arm's pull, Nm."""
-    motor = motor_of(find_table("XM430-W350"))
-    return motor.friction + motor.load_friction * abs(torque + pull)
-
-
-by_mujoco = pytest.param("mujoco", marks=pytest.mark.needs("physics"))
-both = pytest.mark.parametrize("physics", ["independent", by_mujoco])
-
-
-@both
-@pytest.mark.parametrize("gain", [400, 800, 1600])
-def test_an_arm_sags_by_the_torque_that_the_p_gain_gives(physics, gain):
-    line = hang(physics)
-    line.put(position_p_gain=gain, torque_enable=1, goal_position=START)
-    line.wait(3)
-    # gain / 128 is the PWM of a tick, 885 the whole of it (e-Manual, Position PID Gain and Goal PWM)
-    sag = START - line.get("present_position")
-    torque, pull = sag * gain / 128 / 885 * STALL, PULL * math.cos(sag * TICK)
-    assert abs(torque - pull) <= rubbing(torque, pull) + 0.02
-
-
-@both
-def test_a_limp_arm_falls_and_swings(physics):
-    line = hang(physics)
-    line.set("torque_enable", 0)
-    lowest = 0
-    for _ in range(100):
-        line.wait(0.03)
-        lowest = min(lowest, line.get("present_position") - START)
-    assert lowest < -900, "a quarter of a turn is 1024"
-    line.wait(20)
-    hangs = 1024 + line.get("present_position") - START
-    pull = PULL * math.sin(abs(hangs) * TICK)
-    assert pull <= rubbing(0.0, pull) + 0.003
-
-
-@pytest.mark.needs("physics")
-def test_both_ways_of_moving_show_the_host_the_same():
-    lines = [hang("independent"), hang("mujoco")]
-    for line in lines:
-        line.put(torque_enable=1, profile_velocity=60, goal_position=START + 600)
-    for _ in range(40):
-        alone, together = (line.get("present_position") for line in lines)
-        assert together == pytest.approx(alone, abs=3)
-        for line in lines:
-            line.wait(0.05)
-    assert alone > START + 500
 
 
 def test_the_process_of_simulated_buses_moves_bodies():
@@ -181,9 +118,10 @@ def test_friction_of_the_gear_grows_with_what_pulls_at_it(pulled, falls, bodies)
 
 
 @physics
-def test_damping_and_friction_of_the_urdf_are_added():
+@pytest.mark.parametrize("direction", [1, -1])
+def test_damping_and_friction_of_the_urdf_are_added(direction):
     rubbed = FLAT.replace("</joint>", '<dynamics damping="0.3" friction="0.2"/></joint>')
-    bodies = plant_of(rubbed, load=Load(friction=0.1))
+    bodies = plant_of(rubbed, Turned("shoulder", 0.0, direction), load=Load(friction=0.1))
     run(bodies, 3.0, drive=0.5, damping=0.1)
     assert bodies.velocity[0] == pytest.approx((0.5 - 0.2 - 0.1) / (0.3 + 0.1), rel=0.01)
 
