@@ -110,6 +110,7 @@ def test_only_a_run_without_a_gateway_gets_the_advice_to_stop_it(
 @pytest.mark.parametrize("early", [True, False])
 @pytest.mark.parametrize("ends", [True, False])
 def test_client_waits_while_a_robot_starts(
+    dxlrun: Dxlrun,
     begin: Begin,
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
@@ -120,6 +121,7 @@ def test_client_waits_while_a_robot_starts(
     """Early: the process still reads the robot file, so the robot's name is not known yet."""
     awaited = {"PHASE": int(Phase.LOADING), "STEERING": int(GatewayAvailability.AWAITED)}
     child = begin("young_arm", EARLY if early else SUPERVISOR, **awaited)
+    assert ("a robot is starting; try again" in dxlrun("list").out) == early
     waits = []
 
     def sleep(_: float) -> None:
@@ -145,7 +147,7 @@ def test_client_gives_up_a_start_that_hangs(
     passed = [0.0]
     clock = SimpleNamespace(sleep=lambda _: passed.append(passed[-1] + 50.0), monotonic=lambda: passed[-1])
     monkeypatch.setattr("dxlrun.remote.sockets.time", clock)
-    monkeypatch.setattr("dxlrun.remote.sockets._is_starting", lambda robot: True)
+    monkeypatch.setattr("dxlrun.remote.sockets.is_awaited", lambda robot: True)
     assert await_sockets("hung_arm") == {}
     assert passed == [0.0, 50.0, 100.0, 150.0]
     assert caplog.messages == ["waiting for hung_arm, which is starting"]

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from tests.kit.awaited import DEADLINE_S
 
-from dxlrun import RemoteRobot
+from dxlrun import Refused, RemoteRobot
 from dxlrun.remote.computation import computed
 from dxlrun.testing import plan_of
 from dxlrun.tooling.runs import VirtualLink
@@ -84,3 +84,12 @@ def test_virtual_time_stands_still_while_a_copy_works():
     """Else a motion begins later on a busy machine, or its copy is killed after 8 s of virtual time."""
     with RemoteRobot("bioloid_torso", VirtualLink(plan_of(ROBOTS / "bioloid_torso.yaml"))) as robot:
         assert robot.play(ROBOTS / "motions/three_parts.yaml").cycle == 1
+
+
+def test_on_virtual_time_a_copy_that_hangs_is_ended_too(monkeypatch):
+    monkeypatch.setattr("dxlrun.testing.virtual_link.PATIENCE", 0.01)
+    monkeypatch.setattr("dxlrun.remote.gateway.GatewayApp._played", lambda *_: brood())
+    with RemoteRobot("bioloid_torso", VirtualLink(plan_of(ROBOTS / "bioloid_torso.yaml"))) as robot:
+        with pytest.raises(Refused, match="8 s"):
+            robot.play(ROBOTS / "motions/three_parts.yaml")
+        assert robot.states().cycle == 0

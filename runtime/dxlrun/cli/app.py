@@ -233,6 +233,8 @@ _OF_ROBOT = ("robot", "file", "config", "f")
 """Names that other programs give to their option for the robot file, which is positional here."""
 _SIMULATED = ("sim", "simulate", "simulated", "simulation")
 """Names that other programs give to their option for simulated servos."""
+_TIMES = {"in", "for", "time", "duration", "seconds"}
+"""Names that verbs of dxlrun, and other programs, give to an option for a time."""
 _FIRST = {"torque": "on|off", "servo": "/.*"}
 """Verb -> pattern of its first word, which people write last, too: the state, or the port."""
 
@@ -333,7 +335,8 @@ def _usage_error(error: CycloptsError, tokens: Sequence[str]) -> str:
         verb = " ".join(error.command_chain or ())
         if new := verb_registry.RENAMED.get(verb, {}).get(option):
             return f"{option} is {new} now; {fix}"
-        if meant := near(option.lstrip("-"), long) or short:
+        timed = [name for name in long if {name, option.lstrip("-")} <= _TIMES]
+        if meant := near(option.lstrip("-"), long) or timed or short:
             fix = f"did you mean {' or '.join(f'--{name}' for name in meant)}?"
     if isinstance(error, UnusedCliTokensError):
         what = f"unexpected {' '.join(map(repr, error.unused_tokens or ()))}"

@@ -1,5 +1,7 @@
 """Bus: the form of one entry under `buses` of a robot file, a serial line."""
 
+import re
+import sys
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Annotated, Literal
@@ -38,6 +40,12 @@ def _boot_time(value: int) -> int:
 
 _LEAST_LATENCY_NS: Mapping[str, int] = MappingProxyType({"ftdi": 1_000_000, "direct": 0})
 """Latency of each kind of adapter, ns, if the file gives none (protocol.md, Time budget)."""
+
+
+def _port(value: str) -> str:
+    if sys.platform == "linux" and re.fullmatch(r"COM\d+", value):
+        raise validation_error(f"{value} is a port of Windows", "write for example /dev/ttyUSB0, or sim")
+    return value
 
 
 _KINDS: Mapping[str, str] = MappingProxyType(
@@ -124,7 +132,9 @@ class SlowRegisters(Form):
 class Bus(Form):
     """Form of one bus: a serial line with its port, baud rate, adapter and protocol."""
 
-    port: str = key("Serial device of the adapter, or sim for a simulated bus.", "/dev/ttyUSB0", min_length=1)
+    port: Annotated[str, AfterValidator(_port)] = key(
+        "Serial device of the adapter, or sim for a simulated bus.", "/dev/ttyUSB0", min_length=1
+    )
     protocol: Annotated[float, AfterValidator(_protocol)] = Field(
         description="Protocol of all servos on the bus.",
         examples=["1.0"],

@@ -12,15 +12,16 @@ from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 from pydantic import BaseModel, Tag, ValidationError
 from pydantic_core import ErrorDetails
 
-from dxlrun.description.base_form import Mistakes
+from dxlrun.description.base_form import Mistakes, PlugInEntry
 from dxlrun.description.document import KeyPath, Marks, PlainDocument, plain_value, text_of
-from dxlrun.description.mistakes.forms import keys_for
+from dxlrun.description.mistakes.forms import example_at, keys_for
 from dxlrun.description.mistakes.syntax import list_text
 from dxlrun.description.mistakes.words import Remedy, UnknownKeyContext, yaml_text
 from dxlrun.description.units import bound_text, example_of, units_of
 from dxlrun.errors import InputError, Mark, Problem, suggestion, what_and_fix
 from dxlrun.features import broken_features
 from dxlsim.texts.duration import split_quantity
+from dxlwire.control_table.servo_models import perhaps_meant
 
 Form = TypeVar("Form", bound=BaseModel)
 
@@ -428,7 +429,7 @@ def _remedy(error: _Error, marks: Marks) -> str:
     expected = _TYPES.get(error.kind, "")
     if expected == "a list" and isinstance(error.input, str) and (items := _items(error.input, error, marks)):
         return f"write `{error.path[-1] if error.path else 'LIST'}: {items}`"
-    if expected in ("a mapping", "a list") and (fix := _indentation(error) or _only_key(error)):
+    if expected in ("a mapping", "a list") and (fix := _indentation(error) or _only_key(error, marks)):
         return fix
     if error.kind in ("literal_error", "enum"):
         at = None if error.model is None else _without_none(_annotation_at(error.model, error.location))
@@ -440,7 +441,8 @@ def _remedy(error: _Error, marks: Marks) -> str:
     if isinstance(written, int | float) and expected in (_WHOLE, _NUMBER, _BOOL):
         return "remove the quotes" if expected != _WHOLE or isinstance(written, int) else _REMEDIES[_WHOLE]
     if expected == _TEXT and isinstance(error.input, bool | int | float):
-        return f'put it in quotes: "{text_of(error.input)}"'
+        is_model = error.path[-1:] == ("model",)
+        return perhaps_meant(str(error.input)) if is_model else f'put it in quotes: "{text_of(error.input)}"'
     if isinstance(written, str) and expected in (_WHOLE, _NUMBER) and split_quantity(written):
         expected = _WITH_UNIT
     return _example(error) or _REMEDIES.get(expected, "correct it")
@@ -461,7 +463,7 @@ def _items(text: str, error: _Error, marks: Marks) -> str:
     return f"[{', '.join(names)}]" if names else ""
 
 
-def _only_key(error: _Error) -> str:
+def _only_key(error: _Error, marks: Marks) -> str:
     """Return the fix for a value without its key, if only one key can be meant: `loop: 50`; else empty."""
     form = None if error.model is None else _follow(error.model, error.location)
     if form is None or error.input is None:
@@ -472,10 +474,20 @@ def _only_key(error: _Error) -> str:
         meant = [name for name in takes if name in required]
     else:
         meant = takes if isinstance(error.input, str | list) else []  # many keys take a number
+    if len(meant) > 1:  # 1 is a direction by chance only
+        meant = [
+            name for name in meant if get_origin(_without_none(_annotation_at(form, (name,)))) is not Literal
+        ]
     if len(meant) != 1:
         return ""
-    more = ", ..." * (len(required) > 1)
-    return f"write `{error.path[-1]}: {{{meant[0]}: {yaml_text(error.input)}{more}}}`"
+    keys = {meant[0]: yaml_text(error.input)}
+    if issubclass(form, PlugInEntry) and keys[meant[0]].startswith("/dev/"):
+        keys = {"type": example_at(form, ("type",)), "port": keys[meant[0]]}
+    given = [path[1] for path in marks.keys if path[:-1] == ("joint_defaults",) and error.path[0] == "joints"]
+    keys |= {name: example_at(form, (name,)) or "..." for name in sorted(required.difference(keys, given))}
+    such = "write" if len(keys) == 1 else "write for example"
+    entry = f"{{{', '.join(f'{name}: {text}' for name, text in keys.items())}}}"
+    return f"{such} `{entry if isinstance(error.path[-1], int) else f'{error.path[-1]}: {entry}'}`"
 
 
 def _is_key_of_entry(error: _Error) -> bool:

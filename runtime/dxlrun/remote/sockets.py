@@ -171,7 +171,7 @@ def await_sockets(robot: str | None) -> dict[str, Path]:
     """
     found, is_reported, end_s = sockets(), False, time.monotonic() + LONGEST_START_S
     while not (found if robot is None else robot in found):
-        if time.monotonic() >= end_s or not _is_starting(robot):
+        if time.monotonic() >= end_s or not is_awaited(robot):
             return sockets()  # a run that is not starting any more may run by now
         if not is_reported:
             import logging  # a running robot is found without it
@@ -183,7 +183,8 @@ def await_sockets(robot: str | None) -> dict[str, Path]:
     return found
 
 
-def _is_starting(robot: str | None) -> bool:
+def is_awaited(robot: str | None) -> bool:
+    """Return whether a client waits for a robot (None: any) that is starting on this computer."""
     # Imported here because a running robot is found without it.
     from dxlrun.channels.heartbeat import is_starting
     from dxlrun.process_table import found_runs, start_directories

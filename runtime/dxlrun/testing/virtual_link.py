@@ -33,6 +33,8 @@ from dxlrun.remote.preparation import Preparation
 from dxlrun.remote.requests.request_table import Role
 from dxlrun.run.virtual_run import VirtualRobot
 
+PATIENCE = 10.0
+"""Real time for a virtual second in which another process may work, s; the machine may be busy."""
 _EVENTS_CAPACITY = 1 << 20
 """Size of the ring of events, bytes; small, because the gateway reads the events after each cycle."""
 
@@ -212,11 +214,12 @@ class _VirtualTime(asyncio.SelectorEventLoop):
 
     def __init__(self, now_s: Callable[[], float], turn: Callable[[], None]) -> None:
         self._now_s = now_s
-        super().__init__(_Turns(turn))
+        self._turns = _Turns(turn)
+        super().__init__(self._turns)
 
     def time(self) -> float:
-        """Return virtual time, s."""
-        return self._now_s()
+        """Return virtual time, and the timeouts of other processes that did not answer, s."""
+        return self._now_s() + self._turns.expired_s
 
 
 class _Turns(selectors.SelectSelector):
@@ -225,15 +228,19 @@ class _Turns(selectors.SelectSelector):
     def __init__(self, turn: Callable[[], None]) -> None:
         super().__init__()
         self._turn = turn
+        self.expired_s = 0.0
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
         """Return the ready descriptors, after a turn if the caller would wait.
 
-        Virtual time stands still while another process prepares an answer, however long that takes.
+        Virtual time stands still while another process prepares an answer. When that takes PATIENCE times the
+        timeout, the timeout expires.
         """
         waits = timeout is None or timeout > 0
         if waits and len(self.get_map()) > 1:  # the pipe of the other process, and that of the event loop
-            return super().select()
+            ready = super().select(None if timeout is None else PATIENCE * timeout)
+            self.expired_s += 0.0 if ready or timeout is None else timeout
+            return ready
         if waits:
             self._turn()
         return super().select(0)

@@ -7,6 +7,7 @@ from msgspec.structs import replace
 
 from dxlwire.control_table import ControlItem, ControlTable
 from dxlwire.control_table.control_items import SIGN_BIT
+from dxlwire.control_table.servo_models import perhaps_meant_item
 from dxlwire.exceptions import suggestion
 from dxlwire.plan.mode_plan import mode_numbers, position_reach
 
@@ -29,7 +30,7 @@ def item_of(table: ControlTable, name: str) -> ControlItem:
         # A script of another library names an item by its address.
         at_address = {str(item.address): item.name for item in table.items.values()}
         meant = at_address.get(str(name), str(name))
-        hint = suggestion(meant, table.items) if meant not in table.items else f"did you mean {meant}?"
+        hint = perhaps_meant_item(meant, table) if meant not in table.items else f"did you mean {meant}?"
         raise LookupError(f"{table.model} has no item {name!r}; {hint}")
     item = table.items[name]
     if name not in _POSITIONS:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from numbers import Real
 
 import msgspec
 import numpy as np
@@ -136,8 +137,11 @@ class WrittenRows(ABC):
         index = 0
         try:
             for value in values:
-                rows[index][...] = value
+                np.copyto(rows[index], value)  # an assignment makes numbers of texts
                 index += 1  # `enumerate` takes longer
+        except TypeError:
+            self._refuse_values(values)
+            raise
         except ValueError:
             if (given := np.size(values[index])) in (1, servos := self._goals.shape[1]):
                 raise  # Not numbers
@@ -147,12 +151,12 @@ class WrittenRows(ABC):
         self.send_goals()
 
     def _refuse_values(self, values: Sequence[ArrayLike]) -> None:
-        """Raise ValueError for a value that is infinite or None, of which numpy makes NaN."""
+        """Raise ValueError for a value that is infinite or not a number."""
         for item, value in zip(self._items, values, strict=True):
             given = np.broadcast_to(np.asarray(value, object), len(self._servos))
             for servo_id, number in zip(self._servos, given, strict=True):
-                if number is None or math.isinf(number):
-                    raise ValueError(f"{item} of ID {servo_id} is {number}; give a number, or NaN for none")
+                if not isinstance(number, Real) or math.isinf(number):
+                    raise ValueError(f"{item} of ID {servo_id} is {number!r}; give a number, or NaN for none")
 
     @abstractmethod
     def send_goals(self) -> None:

@@ -9,7 +9,7 @@ import re
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 
-from dxlwire.control_table.control_items import ControlTable
+from dxlwire.control_table.control_items import BaseControlTable, ControlTable
 from dxlwire.control_table.table_files import Listing, listings, read_control_table
 from dxlwire.exceptions import suggestion
 
@@ -86,7 +86,27 @@ def model_names(protocol: float | None = None) -> tuple[str, ...]:
 
 def perhaps_meant(name: str, protocol: float | None = None) -> str:
     """Return a hint for an unknown servo model name, such as `did you mean ...?`."""
+    protocols = (1.0, 2.0) if protocol is None else (protocol,)
+    numbered = [models_by_number(int(name), each)[:1] for each in protocols if name.isdecimal()]
+    if models := [table.model for tables in numbered for table in tables]:
+        return f"write {' or '.join(models)}, the name of this model number"
     return beginning_or_near(name, model_names(protocol))
+
+
+def perhaps_meant_item(name: str, table: BaseControlTable, known: Iterable[str] = ()) -> str:
+    """Return a hint for an unknown item of a model: similar names, or those with this word.
+
+    Args:
+        name: The unknown name.
+        table: Control table of the model.
+        known: Names of the possible items, by default all.
+    """
+    known = [*(known or table.items)]
+    longer = [each for each in known if name in each.split("_")]
+    otherwise = f"`dxlrun models {table.model}` lists the items"
+    if 0 < len(longer) <= _MOST_MEANT:
+        otherwise = f"did you mean {' or '.join(longer)}?"
+    return suggestion(name, known, otherwise)
 
 
 def beginning_or_near(name: str, known: Iterable[str]) -> str:

@@ -67,7 +67,7 @@ def list_robots(
     """
     from dxlrun.remote.client import connect
     from dxlrun.remote.network.network_link import known_robots
-    from dxlrun.remote.sockets import running
+    from dxlrun.remote.sockets import is_awaited, running
     from dxlrun.run.unsteered import describe_run, unsteered_runs
 
     here = running()
@@ -100,7 +100,8 @@ def list_robots(
     for info in found:
         _show_robot(info, graph)
     if not found and not code and not unsteered:
-        show_parts("no running robot found; start one by `dxlrun ROBOT.yaml`")
+        starts = "a robot is starting; try again when it runs"
+        show_parts(starts if is_awaited(None) else "no running robot found; start one by `dxlrun ROBOT.yaml`")
     return code
 
 

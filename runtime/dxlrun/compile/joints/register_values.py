@@ -6,9 +6,9 @@ import math
 import struct
 
 from dxlrun.description.units import quantity
-from dxlrun.errors import suggestion
 from dxlwire.bus_plan import RegisterValue
 from dxlwire.control_table import BaseControlTable, ControlItem
+from dxlwire.control_table.servo_models import perhaps_meant_item
 
 
 class UnfitRegister(ValueError):
@@ -35,7 +35,9 @@ def any_value(table: BaseControlTable, name: str, value: int | str) -> RegisterV
     item = table.items.get(name)
     if item is None:
         names = tuple(each.name for each in table.items.values() if each.access == "RW")
-        raise UnfitRegister(f"an {table.model} has no register {name}", suggestion(name, names))
+        raise UnfitRegister(
+            f"an {table.model} has no register {name}", perhaps_meant_item(name, table, names)
+        )
     if item.access == "R":
         raise UnfitRegister(f"{item.title} is read-only", "remove it")
     raw = _raw(item, value)

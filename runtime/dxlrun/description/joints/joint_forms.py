@@ -215,7 +215,7 @@ def joint_conditions() -> tuple[tuple[str, dict[str, object]], ...]:
 def kind_of_joint(joint: object) -> str:
     """Return the tag of a joint's form: `<one servo>`, `<several servos>` or `<no servo>`."""
     if isinstance(joint, dict):
-        if "servos" in joint:
+        if "servos" in joint or isinstance(joint.get("id", joint.get("ids")), list):
             return "<several servos>"
         of_any = BareJoint.model_fields.keys() | {key.name for key in joint_keys()}
         surplus = {re.split(r"[ :=]", key)[0] for key in joint if key not in of_any}

@@ -153,7 +153,7 @@ class UnknownKeyContext(msgspec.Struct, frozen=True):
         """Return the fix that replaces a foreign term by dxlrun's key, with its value converted."""
         place, key = meaning.place, meaning.place[0]
         if key in self.present and len(place) == 1:
-            if elsewhere := places_of(self.root, folded(word), value):
+            if not meaning.kind and (elsewhere := places_of(self.root, folded(word), value)):
                 return self._moved(folded(word), value, elsewhere)
             return f"remove it, or `{key}`: both mean the same"
         if (
@@ -166,6 +166,8 @@ class UnknownKeyContext(msgspec.Struct, frozen=True):
             return f"rename it to `{key}`"
         example = example_at(self.form, place)
         converted = _CONVERSIONS.get(meaning.kind or ".".join(place), _plain)(value, example)
+        if example.startswith("{") and not isinstance(value, dict) and len(place) == 1 and not meaning.kind:
+            converted = None
         text, condition = converted or (example, "")
         such = "write" if converted is not None else "write for example"
         if key in self.present:
@@ -364,6 +366,10 @@ def _drive_mode(value: object, example: str) -> _Written:
     return ("-1" if value & 1 else "1", "") if isinstance(value, int) else None
 
 
+def _ids(value: object, example: str) -> _Written:
+    return (yaml_text([{"id": one} for one in value]), "") if isinstance(value, list) else None
+
+
 def _on_or_off(value: object, example: str) -> _Written:
     return ("on" if value in (True, 1, "on") else "off", "")
 
@@ -387,6 +393,7 @@ def _rate(value: object, example: str) -> _Written:
 
 _CONVERSIONS: Mapping[str, Callable[[object, str], _Written]] = {
     "direction": _direction,
+    "ids": _ids,
     "inverted": _inverted,
     "drive_mode": _drive_mode,
     "pair": _pair,

@@ -13,10 +13,11 @@ from dxlrun.compile.joints.described_servos import DescribedServo, described_ser
 from dxlrun.compile.joints.register_values import UnfitRegister, any_value
 from dxlrun.compile.problems import RobotFile
 from dxlrun.description.reading import Description
-from dxlrun.errors import Mark, suggestion, what_and_fix
+from dxlrun.errors import Mark, what_and_fix
 from dxlrun.features.registers import servo_key
 from dxlwire.bus_plan import BusPlan, RegisterValue, ServoPlan
 from dxlwire.control_table import ControlItem, ControlTable
+from dxlwire.control_table.servo_models import perhaps_meant_item
 
 _LEVEL = "status_return_level"
 _LOWER = ("min_position_limit", "cw_angle_limit")
@@ -142,7 +143,8 @@ def register_value(table: ControlTable, name: str, value: int | str) -> Register
     """
     item = table.items.get(name)
     if item is None:
-        raise UnfitRegister(f"{table.model} has no register {name}", suggestion(name, declarable(table)))
+        meant = perhaps_meant_item(name, table, declarable(table))
+        raise UnfitRegister(f"{table.model} has no register {name}", meant)
     if reason := own_reason(table, item):
         raise UnfitRegister(f"{item.title} cannot be declared: {reason[0]}", reason[1])
     found = any_value(table, name, value)
