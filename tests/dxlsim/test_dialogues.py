@@ -10,12 +10,13 @@
       fault lose servo=1
       note collision                           # the ledger has a note with this text
 
-`gravity=0.5@0.43` (Nm, and where the link hangs), `friction`, `delay_us` and other words describe the servos.
-`let NAME = EXPRESSION`, `poke ITEM = EXPRESSION`, `device ID MODEL`, `hand ANGLE`, `temperature@2`,
-`voltage`, `overload`, `power cycle`, `mute`, `absent slot`, `rate`, `unread ITEM` and `no note` explain
-themselves. Expressions have the functions of `math`; of servo 1 `angle` and `speed` (rad), `tick` and
-`speed_tick` (rad and rad/s of one), `motor` and `memory` (its registers); `clock` and `last_s` (s; of the
-newest reply), and `received` (bytes of the newest answers).
+`gravity=0.5@0.43` (Nm, and where the link hangs), `friction`, `delay_us` (of replies), `response_ms` (of
+goals) and other words describe the servos. `fault ... => TEXT` is refused with a text. `let NAME =
+EXPRESSION`, `poke ITEM = EXPRESSION`, `device ID MODEL`, `hand ANGLE`, `temperature@2`, `voltage`,
+`overload`, `power cycle`, `mute`, `sleepy` (no goal wakes it), `absent slot`, `rate`, `unread ITEM` and `no
+note` explain themselves. Expressions have the functions of `math`; of servo 1 `angle` and `speed` (rad),
+`tick` and `speed_tick` (rad and rad/s of one), `motor` and `memory` (its registers); `clock` and `last_s`
+(s; of the newest reply), and `received` (bytes of the newest answers).
 """
 
 import math
@@ -32,6 +33,7 @@ from tests.kit.simulated_line import Answer, Line, split_statuses
 
 from dxlsim.motion.motor import motor_of
 from dxlsim.simulation_plan import DeviceConfig, Load
+from dxlwire.exceptions import InputError
 
 INSTRUCTIONS = {
     "ping": 1, "read": 2, "write": 3, "reg_write": 4, "action": 5, "reset": 6, "reboot": 8, "clear": 0x10,
@@ -107,6 +109,8 @@ class Dialogue:
         for key, value in given.items():
             if key == "delay_us":
                 settings["return_delay_ns"] = int(value) * 1000
+            elif key == "response_ms":
+                settings["response_delay_ns"] = int(value) * 1_000_000
             else:
                 settings[key] = float(value) if key == "position" else int(value)
         if model.endswith("(2.0)"):
@@ -191,6 +195,9 @@ class Dialogue:
             assert any(rest in note for note in line.notes), line.notes
         elif command == "check":
             self.check(rest)
+        elif command == "fault" and answer:
+            with pytest.raises(InputError, match=re.escape(answer)):
+                line.inject(what)
         else:
             self.change(command, rest)
 
@@ -210,6 +217,7 @@ class Dialogue:
             "overload": servo.trigger_overload,
             "excuse": lambda: line.bus.excuse(int(rest.split(maxsplit=1)[0]) * 1_000_000),
             "power": servo.power_cycle,
+            "sleepy": lambda: setattr(servo, "wakes_on_goal", False),
             "mute": servo.silence,
             "unmute": lambda: servo.silence(False),
             "absent": lambda: setattr(line.bus, "absent", rest),

@@ -13,7 +13,6 @@ from dxlsim.faults.fault import parse_fault
 from dxlsim.servo.making import make_servo
 from dxlsim.servo.simulated_servo import SimulatedServo
 from dxlsim.simulation_plan import BusConfig, DeviceConfig, DeviceReadings, ServoConfig, ServoTimes
-from dxlwire.exceptions import InputError
 
 BACKUP, FAST_SYNC_READ, ACCESS = 0x20, 0x8A, 7
 
@@ -54,17 +53,6 @@ def test_baud_rate_register_follows_the_line_or_no_servo_has_it(model, protocol,
     servo = make_servo(config, rate, 0, protocol=protocol)
     assert servo.registers["baud_rate"] == value
     assert servo.baud_rate == pytest.approx(rate, rel=0.03)
-
-
-def test_waking_by_a_goal_can_be_switched_off():
-    line = Line()
-    line.servo().wakes_on_goal = False
-    line.put(goal_position=700)
-    line.wait(2)
-    assert (line.get("torque_enable"), line.servo().shaft_angle) == (0, 2.0)
-    line.put(torque_enable=1)  # and then it moves to the goal that is there
-    line.wait(2)
-    assert line.get("present_position") == pytest.approx(700, abs=2)
 
 
 @pytest.mark.parametrize(
@@ -114,25 +102,6 @@ def test_a_servo_acts_a_response_delay_later_and_then_as_ever(model, goal, delay
     assert slow[shift:] == pytest.approx(quick[: len(slow) - shift], abs=1e-12)
     assert not any(slow[:shift])
     assert quick[grid]
-
-
-@pytest.mark.parametrize(
-    ("model", "item"),
-    [
-        ("XM430-W350", "torque_enable"),
-        ("XM430-W350", "goal_pwm"),
-        ("AX-12A", "torque_enable"),
-        ("AX-12A", "torque_limit"),
-    ],
-)
-def test_torque_off_or_a_limit_of_0_acts_at_once_and_withdraws_what_has_not_acted_yet(model, item):
-    bus = bus_of(model, delay_ms=20)
-    way(bus, 700, 10 * MS)
-    servo = bus.servo(1)
-    command(servo, **{item: 0})
-    bus.advance_to(200 * MS)
-    assert servo.shaft_angle == pytest.approx(2.0)
-    assert servo.velocity == 0.0
 
 
 def test_goals_act_in_the_order_and_at_the_distance_in_which_they_came():
@@ -217,19 +186,6 @@ def test_a_device_tips_about_its_own_axis_and_stays_so(axis, seen):
             assert imu.world.roll_pitch_yaw == pytest.approx([tipped * each for each in turn], abs=1e-6)
         line.inject(tip)
     assert str(parse_fault("tip servo=241 by=-1rad")) == "tip servo=241 by=-57.29577951308232deg"
-
-
-@pytest.mark.parametrize(
-    ("fault", "refusal"),
-    [
-        ("tip servo=1 by=60deg", "tip is not possible: 1 on bus main is a servo"),
-        ("turn servo=241 by=10deg", "turn is not possible: 241 on bus main is not a servo"),
-        ("lose servo=5", "its servos are 1, its other devices 241"),
-    ],
-)
-def test_faults_of_another_kind_of_unit_are_refused(fault, refusal):
-    with pytest.raises(InputError, match=refusal):
-        line_with(DeviceConfig(241, "bitbots-imu")).inject(fault)
 
 
 def test_bits_of_one_byte_are_buttons():

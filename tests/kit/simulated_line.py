@@ -34,13 +34,14 @@ class Line:
         position: float = 2.0,
         return_delay_ns: int = 500_000,
         write_time_ns: int = 0,
+        response_delay_ns: int = 0,
         start_ns: int = 0,
         adapter: AdapterConfig = WHOLE_REPLIES,
         mechanics: Mechanics | None = None,
         **servo: Any,
     ) -> None:
         self.protocol = protocol or (1.0 if model in model_names(1.0) else 2.0)
-        times = ServoTimes(write_time_ns=write_time_ns)
+        times = ServoTimes(write_time_ns=write_time_ns, response_delay_ns=response_delay_ns)
         servos = tuple(
             ServoConfig(each, model, position, return_delay_ns, times=times, **servo)
             for each in ids or (1, 2)
