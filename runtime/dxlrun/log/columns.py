@@ -71,6 +71,7 @@ class PacketColumns(Sequence[LoggedPacket]):
 
     def select_rows(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> PacketColumns:
         """Return the columns of selected packets, by indices or boolean mask; `data` is not copied."""
+        rows = np.flatnonzero(rows) if rows.dtype == np.bool_ else rows
         return replace(self, **{name: getattr(self, name)[rows] for name in _OF_EACH})
 
     def compact(self) -> PacketColumns:
