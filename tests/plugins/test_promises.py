@@ -1,6 +1,9 @@
 """What every standard controller promises, whatever its law is."""
 
+import math
 import tracemalloc
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -104,6 +107,56 @@ def test_no_memory_grows_in_the_loop(case):
         assert tracemalloc.get_traced_memory()[0] - before < 4000  # a float a cycle would be 9600
     finally:
         tracemalloc.stop()
+
+
+def sent_to(value: Any, goal: float, key: str = "") -> Any:
+    """Return the content of a command, or a controller's keys, with this goal for each position."""
+    if isinstance(value, dict):
+        return {
+            name: f"{goal} rad" if key == "pose" else sent_to(one, goal, name)
+            for name, one in value.items()
+            if not (name == "velocities" and "time" in value)
+        }
+    if key in ("positions", "rows") and isinstance(value, list):
+        return [sent_to(one, goal, key) if isinstance(one, list) else goal for one in value]
+    if isinstance(value, list | tuple):
+        return [sent_to(one, goal) for one in value]
+    return goal if key == "position" else value
+
+
+TO_POSITIONS = [
+    case
+    for case in cases()
+    if "velocity"
+    not in (case.keys.get("reference"), "sample_player" in case.type and case.keys["command_interface"])
+    and any(kind == "play" or sent_to(data, 0.0) != data for kind, data in case.asks)
+]
+
+
+@pytest.mark.parametrize("case", TO_POSITIONS, ids=lambda case: case.name)
+def test_joint_that_wraps_takes_the_shorter_way(case):
+    """From 1 deg before half a turn to 1 deg behind it: by 2 deg, and not by 358 deg."""
+    begin, goal = math.radians(179), math.radians(-179)
+    keys = sent_to(case.keys, goal)
+    if "wrap" in case.controller.Parameters.model_fields:
+        keys["wrap"] = keys["joints"]
+    assert case.asks
+    for kind, data in case.asks:
+        stage = replace(case, keys=keys).stage(present=begin, wrap=True, limits={}).activate()
+        stage.states.temperature[:], stage.states.effort[:], stage.states.age_ns[:] = 45.0, 0.0, 1000
+        stage.send(0.0, kind, **sent_to(data, goal))
+        places = []
+        for cycle in range(1, 150):
+            stage.update(0.02 * cycle, follow=False)
+            commands, place = stage.commands, stage.states.position
+            driven = np.nan_to_num([commands.velocity, commands.effort, commands.pwm]).sum(axis=0)
+            np.copyto(
+                place, np.where(np.isfinite(commands.position), commands.position, place + 0.02 * driven)
+            )
+            places.append(place.copy())
+        assert np.abs(np.array(places) - begin).max() < math.pi
+        if "position" in stage.interfaces.command and "pid" not in case.type and kind != "rows":
+            assert places[-1][0] == pytest.approx(begin + math.radians(2), abs=math.radians(0.5))
 
 
 def test_the_broadcaster_publishes_each_update():
