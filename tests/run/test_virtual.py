@@ -1,16 +1,13 @@
-"""Runs on virtual time: the torso by its formulas, steered and disturbed; two of one seed, every model."""
+"""Runs on virtual time: progress, two of one seed, and every model of a servo."""
 
 import math
-from math import cos, pi, sin
 from pathlib import Path
 
-import numpy as np
 import pytest
 from msgspec.structs import replace
 
 from dxlrun.errors import InputError
 from dxlrun.log.ledger_file import open_ledger
-from dxlrun.log.log_reader import read_log
 from dxlrun.plan.robot_plan import Plan
 from dxlrun.run.virtual_run import VirtualRobot
 from dxlrun.testing import plan_of, simulated_robot
@@ -24,71 +21,6 @@ pytestmark = pytest.mark.long
 
 ROBOTS = Path(__file__).parents[2] / "robots"
 TORSO = ROBOTS / "bioloid_torso.yaml"
-THREE_PARTS = ROBOTS / "motions/three_parts.yaml"
-LAG_S = 0.1
-"""A command goes out in one cycle, moves the servo in the next, and is read in the one after: 60 ms at 50 Hz;
-what the servo's position control lags behind adds the rest."""
-
-
-@pytest.fixture(scope="module")
-def log_of_three_parts(tmp_path_factory):
-    path = tmp_path_factory.mktemp("logs") / "three_parts.mcap"
-    result = simulated_robot(TORSO, play=[THREE_PARTS], duration_s=16.5, log=path).run()
-    assert (result.reason, result.skipped, result.detail) == ("ended", 0, "")
-    return path
-
-
-def left(t: float) -> float:
-    return 0.2 * (sin(2 * t) - sin(4 * t)) - 0.4
-
-
-def right(joint: str, t: float) -> float:
-    return {
-        "right_shoulder_swing_joint": 0.2 * (cos(t) - sin(2 * t)) - 0.4,
-        "right_shoulder_lateral_joint": 0.2 * (sin(2 * t) - cos(1.5 * t)) - 0.4,
-        "right_elbow_joint": 0.2 * (sin(2 * t) - sin(t)) - 0.4,
-    }[joint]
-
-
-@pytest.mark.parametrize("part", ["shoulder_swing_joint", "shoulder_lateral_joint", "elbow_joint"])
-@pytest.mark.parametrize(("arm", "begin_s", "duration_s"), [("left", 4.0, 30.0), ("right", 2.0, 20.0)])
-def test_each_arm_follows_its_formula(log_of_three_parts, arm, part, begin_s, duration_s):
-    joint = f"{arm}_{part}"
-    log = read_log(log_of_three_parts)
-    row = log.joints.index(joint)
-    seconds = (log.cycles["woken_ns"] - log.cycles["scheduled_ns"][0]) * 1e-9 - begin_s
-    during = (seconds >= 0) & (seconds <= duration_s)
-
-    def wanted(t):
-        return left(t) if joint.startswith("left") else right(joint, t)
-
-    goal = log.cycles["goal_position"][during, row]
-    assert goal == pytest.approx(
-        [wanted(t) for t in seconds[during]], abs=0.002
-    )  # between 500 samples: linear
-    settled = (seconds >= LAG_S) & (seconds <= duration_s)
-    read = log.cycles["position"][settled, row]
-    band = np.array([[wanted(t - lag) for lag in np.linspace(0.0, LAG_S, 21)] for t in seconds[settled]])
-    off = 1.5 * 300 / 1023 * pi / 180  # the goal is rounded to a tick, and the compliance margin is one
-    assert (read >= band.min(axis=1) - off).all()
-    assert (read <= band.max(axis=1) + off).all()
-
-
-def test_the_head_obeys_its_commands(log_of_three_parts):
-    log = read_log(log_of_three_parts)
-    yaw, pitch = log.joints.index("head_yaw_joint"), log.joints.index("head_pitch_joint")
-    seconds = (log.cycles["scheduled_ns"] - log.cycles["scheduled_ns"][0]) * 1e-9
-    for t, row, degrees in (
-        (5.9, yaw, 45),
-        (11.9, yaw, -45),
-        (11.9, pitch, 20),
-        (15.9, pitch, -20),
-    ):
-        at = int(np.searchsorted(seconds, t))
-        assert log.cycles["position"][at, row] == pytest.approx(degrees * pi / 180, abs=0.01)
-    moving = (seconds > 6.5) & (seconds < 8.5)
-    speed = np.diff(log.cycles["position"][moving, yaw]).mean() * 50
-    assert speed == pytest.approx(-30 * pi / 180, rel=0.03)
 
 
 def test_virtual_time_refuses_a_real_port():
