@@ -147,41 +147,27 @@ def test_what_may_have_been_received_is_never_sent_again(peer, said, monkeypatch
     assert len(one.heard) == 1
 
 
-def test_an_answer_after_ctrl_c_does_not_meet_the_next_question(peer, monkeypatch):
-    one = peer(OK, OK)
-    with monkeypatch.context() as patch:
-        patch.setattr("dxlrun.remote.sockets._answer", interrupt)
-        with pytest.raises(KeyboardInterrupt):
-            one.robot.pause()
-    one.robot.resume()
-    assert one.connections == 2
-
-
 def interrupt(end):
     """Be interrupted when the answer has come."""
     end.recv(65536)
     raise KeyboardInterrupt
 
 
-def test_a_connection_that_the_gateway_will_close_is_not_used_again(peer):
-    one = peer(OK.replace(b"\r\n\r\n", b"\r\nConnection: close\r\n\r\n"), OK)
-    one.robot.pause()
-    one.robot.resume()
-    assert one.connections == 2
-
-
-def test_a_connection_that_was_closed_while_idle_is_opened_anew(peer):
-    one = peer(OK, OK)
-    one.robot.pause()
-    one.robot.link._end.shutdown(socket.SHUT_RDWR)  # as when the gateway closes it
-    one.robot.resume()
-    assert (len(one.heard), one.connections) == (2, 2)
-
-
-def test_a_connection_that_was_idle_for_long_is_not_used_again(peer, monkeypatch):
-    one = peer(OK, OK)
-    one.robot.pause()
-    monkeypatch.setattr("dxlrun.remote.sockets._IDLE_S", -1.0)
+@pytest.mark.parametrize("why", ["interrupted", "will be closed", "was closed while idle", "idle for long"])
+def test_a_connection_that_may_not_serve_is_not_used_again(peer, monkeypatch, why):
+    closing = OK.replace(b"\r\n\r\n", b"\r\nConnection: close\r\n\r\n")
+    one = peer(closing if why == "will be closed" else OK, OK)
+    if why == "interrupted":  # its answer must not meet the next question
+        with monkeypatch.context() as patch:
+            patch.setattr("dxlrun.remote.sockets._answer", interrupt)
+            with pytest.raises(KeyboardInterrupt):
+                one.robot.pause()
+    else:
+        one.robot.pause()
+    if why == "was closed while idle":
+        one.robot.link._end.shutdown(socket.SHUT_RDWR)  # as when the gateway closes it
+    elif why == "idle for long":
+        monkeypatch.setattr("dxlrun.remote.sockets._IDLE_S", -1.0)
     one.robot.resume()
     assert (len(one.heard), one.connections) == (2, 2)
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 from tests.kit.awaited import DEADLINE_S
+from tests.kit.commands import matches
 from tests.kit.pages import page_text
 from tests.remote.conftest import Arm, Desk
 
@@ -29,7 +30,8 @@ from dxlrun.remote.sockets import MOST_BYTES
 
 DONE = {"done": True, "cycle": 0}
 IN_LIMITS = {"done": True, "clamped": 0, "clamped_joints": []}
-GO = "/controllers/left/commands/go"
+ARM = "/controllers/left/commands"
+GO = f"{ARM}/go"
 SET_POINT = "/controllers/left/set-points/go"
 NUMBERS = {"seconds", "velocity", "rate", "controller_rate", "lowest", "highest"}
 
@@ -55,24 +57,6 @@ def test_what_reaches_the_log_of_a_clients_name_is_short_and_printable(desk, giv
     headers = [] if given is None else [("x-dxlrun-client", given)]
     assert desk.ask("POST", "/pause", headers=headers) == (200, DONE)
     assert desk.taken[0].origin == origin
-
-
-LOAD = {"name": "more", "type": "arm", "joints": ["pan"]}
-HUGE = [
-    (GO, b"[" * 100_000, "go of left is not JSON (recursion limit"),
-    (GO, json.dumps({"positions": ["x"] * 50_000}).encode(), "; and 49995 more"),
-    ("/switch", b"[" * 100_000, "write for example"),
-    ("/rate", b'{"rate": 1' + b"0" * 400 + b"}", "write for example"),
-    ("/controllers", json.dumps(LOAD | {"name": "a" * 65}).encode(), "at most 64"),
-]
-
-
-@pytest.mark.parametrize(("path", "body", "sentence"), HUGE, ids=range(len(HUGE)))
-def test_a_huge_request_is_refused_with_one_short_sentence(desk, path, body, sentence):
-    status, content = desk.ask("POST", path, body)
-    assert (status, content["code"], sentence in content["refused"]) == (422, "invalid", True), content
-    assert len(content["refused"]) < 2001
-    assert desk.taken == []
 
 
 # Quantities with units
@@ -440,39 +424,35 @@ NINES = b"9" * 400
     ],
 )
 def test_what_is_too_deep_or_too_large_for_a_number_is_wrong_input(desk, kind, query, body):
-    status, answer = desk.ask("POST", f"/controllers/left/commands/{kind}{query}", body)
+    status, answer = desk.ask("POST", f"{ARM}/{kind}{query}", body)
     assert status in {404, 422}, answer
     assert desk.taken == []
 
 
-def test_a_body_that_is_too_deep_is_named_so(desk):
-    status, answer = desk.ask("POST", "/controllers/left/commands/positions?units=true", DEEP)
-    assert (status, answer["code"], answer["refused"]) == (
-        422,
-        "invalid",
-        "the body is nested too deeply; use fewer levels",
-    )
+LOAD = {"name": "more", "type": "arm", "joints": ["pan"]}
+NOPES = [f"nope{number}" for number in range(40_000)]
+HUGE = [
+    (GO, b"[" * 100_000, "invalid: go of left is not JSON (recursion limit"),
+    (GO, {"positions": ["x"] * 50_000}, "invalid: ...; and 49995 more"),
+    ("/switch", b"[" * 100_000, "invalid: ...write for example"),
+    ("/rate", b'{"rate": 1' + b"0" * 400 + b"}", "invalid: ...write for example"),
+    ("/controllers", LOAD | {"name": "a" * 65}, "invalid: ...at most 64"),
+    (f"{ARM}/positions?units=true", DEEP, "invalid: the body is nested too deeply; use fewer levels"),
+    *(("/switch", {key: ["left"] * 20_000}, "named_twice: ...left") for key in ("activate", "deactivate")),
+    # of thousands of wrong names an answer has some
+    ("/switch", {"activate": NOPES}, "unknown_controller: "),
+    ("/torque", {"joints": NOPES, "on": False}, "unknown_joint: "),
+    (f"{ARM}/positions?units=true", {"positions": NOPES}, "wrong_quantity: "),
+    (f"{ARM}/position?units=true", {"positions": NOPES}, "unknown_command: "),
+]
 
 
-def test_of_thousands_of_wrong_names_an_answer_has_some(desk):
-    names = [f"nope{number}" for number in range(40_000)]
-    for path, body in (
-        ("/switch", {"activate": names}),
-        ("/torque", {"joints": names, "on": False}),
-        ("/controllers/left/commands/positions?units=true", {"positions": names}),
-        ("/controllers/left/commands/position?units=true", {"positions": names}),
-    ):
-        _, answer = desk.ask("POST", path, body, client=(f"process of {path}", Role.ADMIN))
-        codes = {"unknown_controller", "unknown_joint", "unknown_command", "wrong_quantity"}
-        assert answer["code"] in codes
-        assert len(json.dumps(answer)) < 10_000
-    assert desk.taken == []
-
-
-@pytest.mark.parametrize("key", ["activate", "deactivate"])
-def test_a_switch_that_names_one_thousands_of_times_does_not_reach_the_loop(desk, key):
-    status, answer = desk.ask("POST", "/switch", {key: ["left"] * 20_000})
-    assert (status, answer["code"], answer["fields"]) == (422, "named_twice", {"controller": ["left"]})
+@pytest.mark.parametrize(("path", "body", "refused"), HUGE, ids=range(len(HUGE)))
+def test_a_huge_request_is_refused_with_one_short_answer(desk, path, body, refused):
+    _, answer = desk.ask("POST", path, body)
+    assert matches(f"{refused}...", f"{answer['code']}: {answer['refused']}")
+    assert len(json.dumps(answer)) < 10_000
+    assert len(answer["refused"]) < 2001
     assert desk.taken == []
 
 

@@ -71,13 +71,9 @@ def test_mailbox_can_be_filled_to_its_last_byte_and_no_further(both, beyond):
     assert [one.number for one in both.take_all()] == [0, 1, 2, 3][: sum(posted)]
 
 
-@pytest.mark.parametrize("size", [LONGEST_COMMAND + 1, 10_000_000])
-def test_what_is_too_long_is_refused(both, size):
-    assert not both.writer.post_command(command(1, bytes(size)))
-    assert both.reader.drain_commands() == ()
-
-
-def test_a_set_point_that_is_too_long_is_refused(both):
+def test_what_is_too_long_is_refused(both):
+    for size in (LONGEST_COMMAND + 1, 10_000_000):
+        assert not both.writer.post_command(command(1, bytes(size)))
     assert not both.writer.set_point(0, command(1, bytes(LONGEST_SET_POINT)))
     assert both.reader.drain_commands() == ()
 
@@ -99,22 +95,18 @@ def test_a_writer_that_died_in_a_set_point_is_not_waited_for(both):
     assert list(both.reader.drain_commands()) == []
 
 
-def test_a_set_point_that_is_damaged_is_dropped_and_the_next_one_taken(both):
+def test_what_is_damaged_is_dropped_and_the_next_one_taken(both):
     both.writer.set_point(0, command(1, lease_ns=5))
+    for number in (2, 3):
+        both.writer.post_command(command(number))
     os.pwrite(both.descriptor, b"damage", PLACE_0 + 64 + 30)
+    os.pwrite(both.descriptor, b"damage", OPERATIONS + 64 + 30)
+    assert [one.number for one in both.take_all()] == [3]
     for _ in range(3):
         assert list(both.reader.drain_commands()) == []
-    both.writer.set_point(0, command(2, lease_ns=5))
-    assert [one.number for one in both.reader.drain_commands()] == [2]
-
-
-def test_an_operation_that_is_damaged_is_dropped_and_the_next_one_taken(both):
-    both.writer.post_command(command(1))
-    both.writer.post_command(command(2))
-    os.pwrite(both.descriptor, b"damage", OPERATIONS + 64 + 30)
-    assert [one.number for one in both.take_all()] == [2]
-    both.writer.post_command(command(3))
-    assert [one.number for one in both.take_all()] == [3]
+    both.writer.set_point(0, command(4, lease_ns=5))
+    both.writer.post_command(command(5))
+    assert [one.number for one in both.take_all()] == [5, 4]
 
 
 def test_a_set_point_is_whole_before_it_is_shown(both, monkeypatch):
@@ -168,46 +160,32 @@ def test_counts_at_the_end_of_their_words_get_no_exception_out_of_the_loop(both,
 
 
 def test_answers_come_back_by_their_numbers_and_long_ones_are_cut(both):
-    fields = {"controller": ("arm", "head"), "rate": 0.5}
     given = [
         Completion(7),
         Completion(7, 3),
         Acceptance(("arm",)),
         Refusal(Code.PAUSED_ALREADY),
-        Refusal(Code.INVALID, fields),
+        Refusal(Code.INVALID, {"controller": ("arm", "head"), "rate": 0.5}),
     ]
-    for number, answer in enumerate(given):
-        both.reader.answer_command(number, answer)
     long = Refusal(
         Code.CONTROLLER_FAULT, {"controller": "arm", "problem": '"ä\n' * 10_000, "seen": ("a",) * 999}
     )
-    both.reader.answer_command(5, long)
-    *found, last = both.answers.new()
-    number, cut = last.number, last.answer
-    assert [(one.number, one.answer) for one in found] == list(enumerate(given))
-    assert (number, cut.code, cut.fields["controller"]) == (5, Code.CONTROLLER_FAULT, "arm")
+    many = Acceptance(tuple(f"controller_{index:060}" for index in range(63)))
+    no_utf_8 = Refusal(Code.CONTROLLER_FAULT, {"problem": "no file a\udcff"})
+    large = Refusal(Code.UNKNOWN_GOAL, {"goal": -(10**30), "last": 2**63 - 1})
+    for number, answer in enumerate([*given, long, many, no_utf_8, large]):
+        both.reader.answer_command(number, answer)
+    found = both.answers.new()
+    assert [one.number for one in found] == [*range(9)]
+    *whole, cut, few, escaped, written = (one.answer for one in found)
+    assert whole == given
+    assert (cut.code, cut.fields["controller"]) == (Code.CONTROLLER_FAULT, "arm")
     assert long.fields["problem"].startswith(cut.fields["problem"])
     assert len(cut.fields["problem"]) > 20
+    assert isinstance(few, Acceptance)
+    assert escaped.text == "no file a\\udcff"
+    assert written.fields == {"goal": f"-1{'0' * 30}", "last": 2**63 - 1}
     assert both.answers.new() == []
-
-
-def test_an_answer_that_names_many_controllers_is_cut(both):
-    both.reader.answer_command(1, Acceptance(tuple(f"controller_{index:060}" for index in range(63))))
-    (found,) = both.answers.new()
-    assert found.number == 1
-    assert isinstance(found.answer, Acceptance)
-
-
-def test_a_refusal_with_a_text_that_is_no_utf_8_is_answered(both):
-    both.reader.answer_command(1, Refusal(Code.CONTROLLER_FAULT, {"problem": "no file a\udcff"}))
-    (found,) = both.answers.new()
-    assert found.answer.text == "no file a\\udcff"
-
-
-def test_a_refusal_with_an_integer_that_no_record_can_hold_is_answered(both):
-    both.reader.answer_command(1, Refusal(Code.UNKNOWN_GOAL, {"goal": -(10**30), "last": 2**63 - 1}))
-    (found,) = both.answers.new()
-    assert found.answer.fields == {"goal": f"-1{'0' * 30}", "last": 2**63 - 1}
 
 
 def test_a_descriptor_of_something_else_is_refused():
