@@ -14,7 +14,7 @@ from dxlrun.control.gate import BACK_SPEED, CLAMP_ENDS_NS
 from dxlrun.plan.loop_plan import JointPlan, ServoLimit, SourcePlan
 from dxlrun.plan.policy_plan import SLOW_SPEED, SLOW_START_NS
 from dxlwire.joint_unit import LINEAR, ROTARY
-from dxlwire.modes import COMMAND_INTERFACES, Mode
+from dxlwire.modes import Mode
 
 NAN, INF = np.nan, np.inf
 DT = PERIOD_NS * 1e-9
@@ -355,17 +355,6 @@ def test_a_joint_follows_exactly_only_if_all_joints_can():
     assert rig.goals.position.tolist()[::2] == [pytest.approx(2e-4, abs=5e-5), 0.7]
 
 
-def test_a_joint_that_hangs_outside_its_limits_goes_back_slowly_and_never_further_out():
-    rig = GateRig(start=1.2)
-    goals = [rig.apply(position=one).position for one in (1.2, 1.1, 1.2, 0.5, 1.1)]
-    assert goals == [1.2, 1.1, 1.1, 0.5, 1.0]
-    rig = rig_of(start=-1.3)
-    assert rig.apply(position=-2.0)[:2] == (-1.3, BACK_SPEED)
-    goals = [rig.apply(position=-0.9).position for _ in range(100)]
-    assert min(goals) >= -1.3
-    assert goals[-1] == pytest.approx(-0.9)
-
-
 @SIDES
 def test_a_joint_at_its_limit_has_the_speed_that_is_commanded(side):
     assert GateRig().apply(position=side, velocity=3.0)[:2] == (side, 3.0)
@@ -396,17 +385,6 @@ def test_the_slow_second_of_an_anchored_joint_begins_when_its_goal_leaves_the_an
         assert abs(sent.moved if mode == Mode.POSITION else sent.velocity) <= SLOW_SPEED + 1e-9
     assert sent.clamped == Clamp.STEP
     assert rig.apply(**{name: -5.0})[mode == Mode.VELOCITY] == -5.0
-
-
-def test_a_joint_that_regains_torque_begins_at_rest_and_is_slow_for_a_second():
-    rig = rig_of(**FAR)
-    rig.states.position[:] = [rig.apply(position=8.0).position for _ in range(30)][-1]
-    for torque in (Torque.OFF, Torque.ON):
-        rig.states.torque[:] = torque
-        sent = rig.apply(position=8.0)
-    assert sent.moved == pytest.approx(0.1)
-    assert [rig.apply(position=8.0).moved for _ in range(99)][-1] == pytest.approx(SLOW_SPEED)
-    assert rig.apply(position=8.0).moved > SLOW_SPEED + 0.05
 
 
 # Velocities, efforts and PWM
@@ -500,18 +478,6 @@ def test_a_far_joint_takes_the_full_effort_when_a_kick_is_forgotten():
     efforts = [rig.apply(effort=-0.5).effort for _ in range(40)]
     assert efforts[0] > -0.5
     assert efforts[-1] == -0.5
-
-
-def test_a_joint_that_changes_its_mode_holds_until_it_is_commanded():
-    rig = GateRig(Mode.VELOCITY)
-    rig.apply(velocity=1.0)
-    for mode, expected in ((Mode.UNKNOWN, [NAN] * 4), (Mode.POSITION, [0.4, SLOW_SPEED, NAN, NAN])):
-        rig.states.mode[:], rig.states.position[:] = mode, 0.4
-        values = {name: 0.9 for name in COMMAND_INTERFACES if mode == Mode.UNKNOWN}
-        np.testing.assert_equal(rig.apply(**values)[:4], expected)
-    assert rig.apply(position=0.9).position == pytest.approx(0.4 + SLOW_SPEED * DT)
-    rig.states.mode[:] = Mode.EFFORT
-    np.testing.assert_equal(rig.apply(position=0.9)[:4], [NAN, NAN, 0.0, NAN])
 
 
 # Reports

@@ -42,17 +42,7 @@ def test_the_standard_controllers_enter_by_the_same_door():
     assert found.controllers["joint_state_broadcaster"].distribution.startswith("dxlrun ")
 
 
-def test_a_foreign_plugin_is_offered_with_its_publisher(install):
-    install("my-robotics", "my_plugin", GOOD.replace("TYPE", "my_type"))
-    offer = load_plugins().controllers["my_type"]
-    assert (offer.type, offer.controller.__name__, offer.distribution) == (
-        "my_type",
-        "Mine",
-        "my-robotics 2.5",
-    )
-
-
-def test_a_broken_plugin_is_named_and_the_others_work(install):
+def test_a_broken_plugin_is_named_and_the_others_are_offered_with_their_publishers(install):
     """Other mistakes are in tests/plugins/plain/mistakes.txt."""
     install("broken-one", "broken_plugin", GOOD.replace("return 1", "return 0"))
     install("my-robotics", "my_plugin", GOOD.replace("TYPE", "my_type"))
@@ -62,6 +52,12 @@ def test_a_broken_plugin_is_named_and_the_others_work(install):
     assert "plug-in broken_plugin_entry of broken-one 2.5" in told
     assert "was written for contract 0, but this dxlrun has contract 4" in told
     assert set(found.controllers) >= {"my_type", *STANDARD}
+    offer = found.controllers["my_type"]
+    assert (offer.type, offer.controller.__name__, offer.distribution) == (
+        "my_type",
+        "Mine",
+        "my-robotics 2.5",
+    )
 
 
 def test_a_type_that_two_plugins_offer_is_nobodys(install):

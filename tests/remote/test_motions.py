@@ -206,31 +206,28 @@ def test_a_failure_in_the_check_of_a_motion_is_that_of_one_request(head, monkeyp
     assert play(head, NOD)[0] == 200
 
 
-def lead_to(head, position):
-    """Return when each command to the joint `pan` is given, and its positions, on the way to one point."""
+@pytest.mark.parametrize(
+    ("position", "seconds", "goal", "velocity"),
+    [
+        (0.204, 0.0, None, None),  # a few ticks take no time, and a short way takes its least one
+        (0.206, 0.2, None, None),
+        (0.22, 0.2, None, None),
+        (0.4, 0.4, None, None),
+        (0.7, 2.0, None, 0.25),  # a joint that is slower than the soft speed gets its own time
+        (0.7, 0.5, 0.45, None),  # from the goal of a joint, and not from where it lags behind
+    ],
+)
+def test_the_way_to_a_first_pose_takes_its_time(head, position, seconds, goal, velocity):
+    joints = head.gateway._preparation.joints
+    joints["pan"] = replace(joints["pan"], velocity=velocity or joints["pan"].velocity)
+    head.record.goals.position[0] = goal or np.nan
+    head.finish_cycle()
     text = HEAD % "positions" + POINT % f"pan: {{position: {position} rad}}"
     status, answer, found = play(head, text)
     assert status == 200, answer
     ((_, _, times, arrays, _),) = found
-    return times, [array[0] for array in arrays]
-
-
-def test_a_joint_that_is_slower_than_the_soft_speed_gets_its_own_time(head):
-    joints = head.gateway._preparation.joints
-    joints["pan"] = replace(joints["pan"], velocity=0.25)
-    assert lead_to(head, 0.7)[0][-1] == pytest.approx(2.0)
-
-
-def test_the_way_begins_at_the_goal_of_a_joint_not_where_it_lags_behind(head):
-    head.record.goals.position[0] = 0.45
-    head.finish_cycle()
-    times, positions = lead_to(head, 0.7)
-    assert (positions[0], times[-1]) == (0.45, pytest.approx(0.5))
-
-
-@pytest.mark.parametrize(("position", "seconds"), [(0.204, 0.0), (0.206, 0.2), (0.22, 0.2), (0.4, 0.4)])
-def test_a_short_way_takes_its_least_time_and_one_of_a_few_ticks_none(head, position, seconds):
-    assert lead_to(head, position)[0][-1] == pytest.approx(seconds)
+    assert times[-1] == pytest.approx(seconds)
+    assert seconds == 0.0 or arrays[0][0] == (goal or 0.2)
 
 
 def test_motion_that_loops_has_no_length():

@@ -27,46 +27,34 @@ GRANTS = (
 )
 
 
-def console(*, terminal: bool) -> tuple[Console, io.StringIO]:
+def shown(
+    grants: tuple[Grant, ...], *, terminal: bool = True, verbose: bool = False
+) -> tuple[str, tuple[str, ...]]:
+    """Return what is printed of grants, and what remains as remarks."""
     text = io.StringIO()
-    return Console(file=text, force_terminal=terminal, width=60, no_color=True, highlight=False), text
+    out = Console(file=text, force_terminal=terminal, width=60, no_color=True, highlight=False)
+    show_grants(grants, out, verbose=verbose)
+    return text.getvalue(), refusals(grants, out)
 
 
-def test_a_terminal_gets_a_table_and_each_command_once_and_unbroken():
-    out, text = console(terminal=True)
-    show_grants(GRANTS, out)
-    lines = text.getvalue().splitlines()
+def test_a_terminal_gets_a_table_others_remarks_and_the_log_all():
+    table, remarks = shown(GRANTS)
+    lines = table.splitlines()
     assert len(lines) == 2 + len(GRANTS) + 1  # head, rule, grants, fix
     assert lines[2].split()[:3] == ["timer", "slack", "yes"]
     assert "guardian: scheduler" in lines[4]
-    assert lines[5].count("allow it with `a long command`") == 1
-    assert refusals(GRANTS, out) == ()
-
-
-@pytest.mark.parametrize("verbose", [False, True])
-def test_one_line_says_that_all_was_granted(verbose):
-    out, text = console(terminal=True)
-    show_grants(GRANTS[:1], out, verbose=verbose)
-    assert (text.getvalue() == "real time: all granted\n") == (not verbose)
-    assert ("timer slack" in text.getvalue()) == verbose
-
-
-def test_elsewhere_what_was_refused_is_a_remark_of_its_own():
-    out, text = console(terminal=False)
-    show_grants(GRANTS, out)
-    assert text.getvalue() == ""
-    assert refusals(GRANTS, out) == (
-        "it was refused, so that: allow it with `a long command`",
-        "guardian: it was refused: allow it with `a long command`",
-    )
-
-
-def test_the_log_has_it_all():
+    assert lines[5].count("allow it with `a long command`") == 1, "once, and unbroken"
+    assert remarks == ()
+    fix = "allow it with `a long command`"
+    each = f"it was refused, so that: {fix}", f"guardian: it was refused: {fix}"
+    assert shown(GRANTS, terminal=False) == ("", each)
     assert granted_text(GRANTS) == {
         "timer slack": "yes: timer slack 1 ns",
         "scheduler": "no: it was refused, so that",
         "guardian: scheduler": "no: it was refused",
     }
+    assert shown(GRANTS[:1])[0] == "real time: all granted\n"
+    assert "timer slack" in shown(GRANTS[:1], verbose=True)[0]
 
 
 ROBOT = """\

@@ -17,22 +17,14 @@ from dxlrun.run.run_log import discard_log, new_log
 pytestmark = pytest.mark.long
 
 
-@pytest.fixture
-def one_second(monkeypatch):
+def test_a_name_is_taken_once_and_discarding_leaves_the_logs_of_other_runs(tmp_path, monkeypatch):
     monkeypatch.setattr("time.strftime", lambda _: "20261121_120000")
-
-
-@pytest.mark.usefixtures("one_second")
-def test_a_name_is_taken_once(tmp_path):
-    names = [new_log(RecordingPlan(str(tmp_path)), "pair").name for _ in range(3)]
-    assert names == [f"pair_20261121_120000{number}.mcap" for number in ("", "_2", "_3")]
-
-
-@pytest.mark.usefixtures("one_second")
-def test_discarding_leaves_the_other_runs_log(tmp_path):
-    ours, other = new_log(RecordingPlan(str(tmp_path)), "pair"), new_log(RecordingPlan(str(tmp_path)), "pair")
+    ours, *others = [new_log(RecordingPlan(str(tmp_path)), "pair") for _ in range(3)]
+    assert [one.name for one in (ours, *others)] == [
+        f"pair_20261121_120000{n}.mcap" for n in ("", "_2", "_3")
+    ]
     discard_log(ours)
-    assert [path.name for path in tmp_path.iterdir()] == [other.name]
+    assert {*tmp_path.iterdir()} == {*others}
 
 
 def _virtual_run(directory: Path) -> None:
@@ -67,14 +59,11 @@ def test_a_directory_that_takes_no_file_is_an_input_error(tmp_path, monkeypatch)
     def refuse(path, mode, *, exist_ok):
         raise PermissionError(errno.EACCES, "Permission denied", str(path))
 
+    with pytest.raises(InputError, match="File name too long"):
+        new_log(RecordingPlan(str(tmp_path)), "a" * 300)
     monkeypatch.setattr(Path, "touch", refuse)
     with pytest.raises(InputError, match=r"no log can be written in .*: Permission denied; .*--no-record"):
         new_log(RecordingPlan(str(tmp_path)), "pair")
-
-
-def test_a_name_too_long_is_an_input_error(tmp_path):
-    with pytest.raises(InputError, match="File name too long"):
-        new_log(RecordingPlan(str(tmp_path)), "a" * 300)
 
 
 def test_the_home_directory_is_meant_by_a_tilde(tmp_path, monkeypatch):

@@ -89,17 +89,13 @@ def test_idle_connections_do_not_keep_the_browser_out(recorded, serve):
         assert served.look()["moment"]
 
 
-def test_only_meshes_of_the_urdf_are_given_away(recorded, serve, tmp_path):
-    served = serve(recorded)
-    for name in ("/etc/passwd", "../../etc/passwd", "robot.yaml", "", "bioloid_torso.urdf"):
-        assert served.ask(f"/mesh?name={name}")[0] == 404
+def test_mesh_is_found_beside_the_robot_or_in_its_package(tmp_path):
     (tmp_path / "meshes").mkdir()
     (tmp_path / "meshes/a.stl").write_bytes(b"solid")
     (tmp_path / "robot").mkdir()
-    assert mesh_file(tmp_path, "meshes/a.stl") == tmp_path / "meshes/a.stl"
-    assert (
-        mesh_file(tmp_path / "robot", f"package://{tmp_path.name}/meshes/a.stl") == tmp_path / "meshes/a.stl"
-    )
+    found = tmp_path / "meshes/a.stl"
+    assert mesh_file(tmp_path, "meshes/a.stl") == found
+    assert mesh_file(tmp_path / "robot", f"package://{tmp_path.name}/meshes/a.stl") == found
     assert mesh_file(tmp_path, "package://other/meshes/b.stl") is None
 
 
@@ -119,6 +115,16 @@ def test_mesh_that_the_urdf_does_not_name_is_not_served(recorded, serve, tmp_pat
     monkeypatch.setattr(recorded, "urdf", lambda: '<robot><mesh filename="named.stl"/></robot>')
     served = serve(recorded)
     assert served.ask("/mesh?name=named.stl") == (200, b"robot/named.stl")
-    others = ("other.stl", "other.dae", "../beside/other.obj", "../other.stl", "package://beside/other.obj")
+    others = (
+        "/etc/passwd",
+        "../../etc/passwd",
+        "robot.yaml",
+        "",
+        "other.stl",
+        "other.dae",
+        "../beside/other.obj",
+        "../other.stl",
+        "package://beside/other.obj",
+    )
     for name in (*others, str(tmp_path / "other.stl"), "package://robot/named.stl", "./named.stl"):
         assert served.ask(f"/mesh?name={name}")[0] == 404, name
