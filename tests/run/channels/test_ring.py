@@ -298,28 +298,6 @@ def test_a_reader_beside_a_writing_process_gets_or_misses_each_record_once(make)
     assert seen == count
 
 
-def test_a_writer_that_is_killed_at_any_moment_leaves_whole_records(make):
-    """Eight writers, one after the other, each killed in the middle of a storm; a record cut off is a gap."""
-    descriptor = make(1 << 16, 400)
-    reader = RingReader(descriptor)
-    chance, seen = random.Random(2), 0
-    endless = WRITER.replace("range(int(sys.argv[2]))", "iter(int, 1)").replace('b"%d " % number', 'b"7 "')
-    for _ in range(8):
-        with subprocess.Popen(
-            [sys.executable, "-c", endless, str(descriptor)], pass_fds=[descriptor]
-        ) as process:
-            until = reader.head + chance.randrange(200_000)
-            while reader.head <= until:
-                assert process.poll() is None
-            process.kill()
-        for got in all_of(reader):
-            assert isinstance(got, Gap) or set(got.payload) <= set(b"7 ")
-            seen += isinstance(got, Record)
-        append(RingWriter(descriptor), b"7 after a kill")
-        assert event(b"7 after a kill") in all_of(reader)
-    assert seen > 100
-
-
 def test_a_queue_knows_how_far_its_reader_is(make):
     descriptor = make(128, 16)
     writer, reader = RingWriter(descriptor), RingReader(descriptor)
