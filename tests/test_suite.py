@@ -267,18 +267,16 @@ def test_a_property_draws_the_same_examples_again() -> None:
     assert settings().derandomize
 
 
-@pytest.fixture(scope="module")
-def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the sdist and the wheel."""
-    folder = tmp_path_factory.mktemp("built")
-    words = ("hatchling", "build", "--target", "sdist", "--target", "wheel", "--directory", str(folder))
-    ran = run("-m", *words)
+def built(target: str, folder: Path) -> Path:
+    """Return the sdist or the wheel."""
+    ran = run("-m", "hatchling", "build", "--target", target, "--directory", str(folder))
     assert ran.returncode == 0, ran.stdout + ran.stderr
-    return folder
+    (archive,) = folder.iterdir()
+    return archive
 
 
-def test_sdist_has_every_file_of_its_folders(built: Path) -> None:
-    (archive,) = built.glob("*.tar.gz")
+def test_sdist_has_every_file_of_its_folders(tmp_path: Path) -> None:
+    archive = built("sdist", tmp_path)
     with tarfile.open(archive) as tar:
         packed = {name.partition("/")[2] for name in tar.getnames()}
     found = (path for folder in SHIPPED for path in (ROOT / folder).rglob("*") if path.is_file())
@@ -321,10 +319,9 @@ def test_each_fragment_of_the_changelog_is_one_that_towncrier_takes() -> None:
     assert config["start_string"] in (ROOT / config["filename"]).read_text()
 
 
-def test_wheel_has_every_object_robot_and_motion(built: Path) -> None:
+def test_wheel_has_every_object_robot_and_motion(tmp_path: Path) -> None:
     """For `dxlrun examples`; the top level of the repository stays their only source."""
-    (wheel,) = built.glob("*.whl")
-    with zipfile.ZipFile(wheel) as archive:
+    with zipfile.ZipFile(built("wheel", tmp_path)) as archive:
         compiled = {
             one.filename for one in archive.filelist if one.filename.endswith(".so") and one.file_size
         }
