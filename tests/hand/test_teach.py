@@ -21,7 +21,7 @@ name: arm
 arguments: {port: {default: sim, help: port}}
 buses:
   main: {port: "${port}", protocol: 2.0, baud_rate: 1_000_000, adapter: {latency: 0 ms}}
-loop: {rate: 50}
+loop: {rate: 50, scheduler: {policy: round_robin, priority: 31}}
 joint_defaults: {bus: main, reference: 180 deg}
 groups: {hand: {joints: [wrist]}}
 joints:
@@ -58,6 +58,7 @@ def enable_torque(robot: RemoteRobot) -> bool:
 @pytest.fixture
 def robot(live: LiveRobot) -> Iterator[RemoteRobot]:
     """The robot as it is after its start; on a busy machine servos may be lost for some cycles."""
+    live.restart()
     with connect() as robot:
         yield robot
         live.until(lambda: enable_torque(robot))

@@ -134,6 +134,11 @@ class LiveRobot:
             self._run = subprocess.Popen(words, cwd=self._directory, stdout=said, stderr=said)
         self.until(lambda: bool(running()))
 
+    def restart(self) -> None:
+        """Run the robot again where it has ended: a loop without a processor for 0.1 s is killed."""
+        if self._run is not None and self._run.poll() is not None:
+            self.start()
+
     def __enter__(self) -> Self:
         return self
 

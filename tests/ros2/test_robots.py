@@ -101,8 +101,8 @@ def test_a_servo_reboots_by_a_service(two: Two) -> None:
     mark, kind = two.arm.mark(), "std_srvs/srv/Trigger"
     switch = {"deactivate_controllers": ["arm"], "strictness": 2, "timeout": seconds(5.0)}
     words = "/controller_manager/switch_controller", "controller_manager_msgs/srv/SwitchController"
-    assert two.foreign.do("call", *words, switch)["ok"]
-    assert two.foreign.do("call", "/arm/reboot", kind, {})["success"]
+    assert (switched := two.foreign.do("call", *words, switch))["ok"], switched
+    assert (answer := two.foreign.do("call", "/arm/reboot", kind, {}))["success"], answer["message"]
     rebooted = until(
         lambda: [one.servo_id for one in two.arm.sent(mark) if one.instruction == wire.REBOOT], "reboots"
     )
