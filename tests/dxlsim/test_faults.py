@@ -55,11 +55,13 @@ def test_times_count_from_the_start_of_the_simulation():
     script.attach((line.bus,), start_ns=7_000 * MS)
     line.clock.wait_until(7_400 * MS)
     script.add(parse_fault("silence servo=2 at=800ms"), line.clock.now_ns())
+    assert [fault.servo for fault in script.waiting] == [1, 2]
     for servo_id, at_ms in ((1, 7_500), (2, 7_800)):
         line.clock.wait_until((at_ms - 1) * MS)
         assert ping(line, servo_id)
         line.clock.wait_until((at_ms + 1) * MS)
         assert not ping(line, servo_id)
+    assert script.waiting == ()
 
 
 def test_faults_by_hand_overlap_with_those_of_the_script():

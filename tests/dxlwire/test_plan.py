@@ -151,10 +151,11 @@ def test_a_socket_is_a_line_that_stays_lost():
         assert not lines.lost(0)
 
 
-def test_a_line_that_is_back_under_another_name_has_its_old_descriptor(adapters, kept):
+def test_a_line_that_is_back_under_another_name_has_its_old_descriptor_and_lock(adapters, kept):
     before, opened = list(kept.descriptors), len(os.listdir("/proc/self/fd"))
     adapters[1].unplug()
     assert kept.lost(1)
+    assert os.readlink(f"/proc/self/fd/{kept.descriptors[1]}") == os.devnull
     assert kept.returned() == []
     adapters[1].plug_in()
     assert returned(kept) == [1]
@@ -164,14 +165,8 @@ def test_a_line_that_is_back_under_another_name_has_its_old_descriptor(adapters,
     assert adapters[1].heard() == b"right"
     os.write(kept.descriptors[0], b"left")
     assert adapters[0].heard() == b"left"
-
-
-def test_while_a_line_is_gone_nobody_has_its_old_device_open(adapters, kept):
-    adapters[0].unplug()
-    kept.lost(0)
-    assert os.readlink(f"/proc/self/fd/{kept.descriptors[0]}") == os.devnull
-    adapters[0].plug_in()
-    assert returned(kept) == [0]
+    with pytest.raises(PortError, match="in use"):
+        KeptLines([LineSettings(str(adapters[1].link), 1_000_000, 0)])
 
 
 def test_a_line_that_is_gone_for_long_is_tried_each_two_seconds(adapters, kept, monkeypatch):
@@ -198,15 +193,6 @@ def test_both_lines_may_be_gone_at_once_and_come_back_in_any_order(adapters, kep
     assert returned(kept) == [1]
     adapters[0].plug_in()
     assert returned(kept) == [0]
-
-
-def test_a_line_that_is_back_is_locked_against_every_other_program(adapters, kept):
-    adapters[0].unplug()
-    kept.lost(0)
-    adapters[0].plug_in()
-    returned(kept)
-    with pytest.raises(PortError, match="in use"):
-        KeptLines([LineSettings(str(adapters[0].link), 1_000_000, 0)])
 
 
 def test_of_two_lines_of_which_one_is_missing_neither_is_kept(adapters):
