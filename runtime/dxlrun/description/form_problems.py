@@ -516,8 +516,8 @@ def _example(error: _Error) -> str:
     key = error.path[-1] if error.path else ""
     example = error.example if isinstance(key, str) else None
     if example is None and error.model is not None and error.path[1:] and error.location[1:]:
-        # An entry has no example of its own, but its section has one. The last step may be a tag of a union.
-        steps = error.location[: -2 if str(error.location[-1]).startswith("<") else -1]
+        # An entry has no example of its own, but its section has one. The last step may be a union's member.
+        steps = error.location[: -1 if error.location[-1] == error.path[-1] else -2]
         key, example = error.path[-2], _example_at(error.model, steps)
     return "" if example is None else f"write for example `{key}: {example}`"
 

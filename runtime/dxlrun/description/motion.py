@@ -63,23 +63,12 @@ class Target(JointForm):
         return self.position, self.velocity, self.acceleration
 
 
-def _kind_of_pose(pose: object) -> str:
-    return "<positions>" if isinstance(pose, dict) else "<name>"
-
-
-WrittenPose = Annotated[
-    Annotated[Name, Tag("<name>")] | Annotated[dict[str, object], Tag("<positions>")],
-    Discriminator(_kind_of_pose),
-]
-"""Pose of a point, whose joints `Poses` finds."""
-
-
 class Point(Form):
     """Form of a point of a motion: a time, and goals of some joints."""
 
     time: Duration = key("Time since the start of the part.", "1 s")
     joints: dict[Name, Target] = key("Targets by joint.", "{head_joint: {position: 30 deg}}", {})
-    pose: WrittenPose | None = key(
+    pose: str | dict[str, object] | None = key(
         "Pose for the joints that `joints` does not name: a name of the robot file, positions by joint, or a "
         "pose of a link as in `poses`.",
         "rest",
