@@ -155,6 +155,7 @@ def test_each_servo_of_a_group_gets_another_id(script):
         ("goal_position", [1.0, 2.0], "2 values for 3 servos"),
         ("operating_mode", "wheel", "'wheel' is not a value"),
         ("led", "on", "the item takes a number"),
+        ("led", {1: 1}, "the item takes a number"),
         ("present_position", 1.0, r"Present Position \(132\) of XM430-W350 is read-only"),
         ("torque_enable", 1, "use `servos.torque = True`"),
         ("goal_positon", 1.0, "has no item 'goal_positon'; did you mean goal_position"),
@@ -335,10 +336,14 @@ def test_set_of_servos_is_a_mapping_of_ids_and_takes_numbers_of_numpy(script):
     assert (2 in servos, 7 in servos, servos[np.int64(3)].ids) == (True, False, (3,))
     servos.write("led", np.int64(1))
     servos.write("led", np.array(0))
+    with pytest.raises(ValueError, match="is a list; give 'led' without brackets"):
+        script.bus.scan().writer(["led"])
     with pytest.raises(ValueError, match="led is named twice"):
         servos.reader("led", "led")
     with pytest.raises(LookupError, match=r"no servo with ID 'led' here; there are \[1, 2, 3\]"):
         servos["led"]
+    with pytest.raises(LookupError, match="write XM430-W350, the name of this model number"):
+        script.bus.servos({1: 1020})
 
 
 def test_states_belong_to_the_caller(script):

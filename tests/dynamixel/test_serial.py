@@ -130,6 +130,8 @@ def test_a_missing_device_and_a_file_are_named(tmp_path):
     path.touch()
     with pytest.raises(PortError, match=r"port COM3 not found; that is a port of Windows; "):
         open_serial("COM3", 57_600)
+    with pytest.raises(PortError, match="port sim not found; start simulated servos by `dxlrun sim "):
+        open_serial("sim", 57_600)
     with pytest.raises(PortError, match=r"port null not found; write /dev/null") as refused:
         open_serial("null", 57_600)
     assert refused.value.__suppress_context__  # a script shows the sentence after one traceback

@@ -11,6 +11,7 @@ import pytest
 from tests.kit.awaited import DEADLINE_S
 
 from dxlrun import Refused, RemoteRobot
+from dxlrun.errors import RunGone
 from dxlrun.remote.computation import computed
 from dxlrun.testing import plan_of
 from dxlrun.tooling.runs import VirtualLink
@@ -93,3 +94,5 @@ def test_on_virtual_time_a_copy_that_hangs_is_ended_too(monkeypatch):
         with pytest.raises(Refused, match="8 s"):
             robot.play(ROBOTS / "motions/three_parts.yaml")
         assert robot.states().cycle == 0
+    with pytest.raises(RunGone, match="its link is closed"):
+        robot.states()

@@ -54,7 +54,7 @@ def steered(tmp_path_factory, runs, place):
     robot = run.robot
     robot.send("hold", "positions", {"positions": np.array([0.1, 0.1])})
     with pytest.raises(dxlrun.Refused, match="pan"):
-        robot.switch(["solo"])
+        robot.switch("solo")
     robot.switch(activate=["solo"], deactivate=["hold"])
     with robot.stream("solo", "positions", lease=0.1) as stream:
         assert stream.send({"positions": [1e9]}) == 1

@@ -30,7 +30,7 @@ from dxlrun.compile.problems import RobotFile, into_mark, joint_mark
 from dxlrun.contract.controller import NOT_BY_JOINT, SpeedPeak
 from dxlrun.control.controllers.claims import claimed_modes, start_modes
 from dxlrun.control.controllers.plugin_loading import Offer, PlugIns
-from dxlrun.control.controllers.single_files import file_of, is_of_file
+from dxlrun.control.controllers.single_files import class_beside, file_of, is_of_file
 from dxlrun.control.controllers.update_order import below, rate_divider, rate_fits
 from dxlrun.description.base_form import ParametersModel, PlugInEntry
 from dxlrun.description.document import KeyPath, read_file
@@ -67,7 +67,8 @@ def read_controller_files(file: RobotFile) -> dict[str, str]:
         path = folder / (name or "")
         if name is None or path.resolve().parent != folder.resolve():
             what = f"{entry.type} of {controller} is not a class in the folder of the robot file"
-            file.error(mark, what, "write ./wave.py:Wave for the class Wave in wave.py")
+            meant = class_beside(folder, entry.type)
+            file.error(mark, what, f"write {meant or './wave.py:Wave for the class Wave in wave.py'}")
             continue
         try:
             texts[name] = read_file(path).decode("utf-8")
@@ -259,6 +260,11 @@ def _offer(file: RobotFile, name: str, type_name: str, plugins: PlugIns) -> Offe
     offer = plugins.controllers.get(type_name)
     if offer is None and is_of_file(type_name) and not ros and type_name not in plugins.broken:
         return None  # the unreadable file has been reported
+    known = offer is not None or ros or is_of_file(type_name)
+    if not known and (meant := class_beside(file.description.path.parent, type_name)):
+        what = f"no plug-in offers the controller type {type_name} of {name}"
+        file.error(file.at("controllers", name, "type"), what, f"write {meant}")
+        return None
     try:
         return find_offer(name, type_name, plugins)
     except WrongEntry as wrong:

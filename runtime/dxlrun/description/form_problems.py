@@ -441,11 +441,18 @@ def _remedy(error: _Error, marks: Marks) -> str:
     if isinstance(written, int | float) and expected in (_WHOLE, _NUMBER, _BOOL):
         return "remove the quotes" if expected != _WHOLE or isinstance(written, int) else _REMEDIES[_WHOLE]
     if expected == _TEXT and isinstance(error.input, bool | int | float):
-        is_model = error.path[-1:] == ("model",)
-        return perhaps_meant(str(error.input)) if is_model else f'put it in quotes: "{text_of(error.input)}"'
+        return _text_for_number(error)
     if isinstance(written, str) and expected in (_WHOLE, _NUMBER) and split_quantity(written):
         expected = _WITH_UNIT
     return _example(error) or _REMEDIES.get(expected, "correct it")
+
+
+def _text_for_number(error: _Error) -> str:
+    """Return the fix for a number in place of a text: the model with this number, else quotes."""
+    if error.path[-1:] == ("model",):
+        return perhaps_meant(str(error.input))
+    is_device = error.path[-1:] == ("port",)  # no port is a number
+    return (_example(error) if is_device else "") or f'put it in quotes: "{text_of(error.input)}"'
 
 
 def _items(text: str, error: _Error, marks: Marks) -> str:

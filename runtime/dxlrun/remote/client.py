@@ -378,13 +378,13 @@ class RemoteRobot:
         """Return a stream of set-points for a controller; the newest set-point is valid for `lease` s."""
         return Stream(self, controller, kind, lease)
 
-    def switch(self, activate: Sequence[str] = (), deactivate: Sequence[str] = ()) -> Executed:
+    def switch(self, activate: str | Sequence[str] = (), deactivate: str | Sequence[str] = ()) -> Executed:
         """Activate and deactivate controllers in one cycle, all or none; returns when the switch is complete.
 
         A switch takes longer when servos must change their operating mode first. Raises Refused when a servo
         does not change its mode.
         """
-        return self._execute(requests.SWITCH, body=Switch(tuple(activate), tuple(deactivate)))
+        return self._execute(requests.SWITCH, body=Switch(_listed(activate), _listed(deactivate)))
 
     def get(self, joint: str, item: str = "") -> dict[str, object]:
         """Return a joint's newest state, SI units, or a control table item of its servo, read in idle time.

@@ -115,7 +115,8 @@ def has_own_times(controller: str, kind: str) -> str:
 
 
 def value_not_finite(controller: str, kind: str, joint: str, value: object) -> str:
-    return f"{kind} of {controller}: {joint} is {str(value)[:40]!r}, but must be a finite number"
+    fix = "give it in SI units, or `units=True` for texts with units"
+    return f"{kind} of {controller}: {joint} is {str(value)[:40]!r}, but must be a finite number; {fix}"
 
 
 def quantities_of_joints(controller: str, quantities: Sequence[str]) -> str:

@@ -161,7 +161,9 @@ class VirtualLink:
     # Requests of the client
 
     def exchange(self, method: str, path: str, body: bytes | None) -> tuple[int, bytes]:
-        """Pass a request to the gateway; raises RunGone if that needs a cycle after the end of the run."""
+        """Pass a request to the gateway; raises RunGone if it needs a cycle after the end or `close`."""
+        if self._waiting.is_closed():
+            raise RunGone(f"the run of {self.name} ended: its link is closed")
         self.gateways_link.collect_messages()
         return self._waiting.run_until_complete(self._serve_request(method, path, body or b""))
 

@@ -61,10 +61,10 @@ def ticks_of(table: ControlTable, item: ControlItem, value: float | str, *, raw:
     Raises:
         ValueError: The value is outside the range of the item, or no mode has this name.
     """
-    if isinstance(value, str):
+    if value is None or isinstance(value, str | dict):
         numbers = mode_numbers(table) if item.name in MODE_ITEMS else {}
-        if value not in numbers:
-            hint = suggestion(value, numbers, "the item takes a number" if not numbers else "")
+        if value not in [*numbers]:
+            hint = suggestion(str(value), numbers, "the item takes a number" if not numbers else "")
             raise ValueError(f"{item.name} of {table.model}: {value!r} is not a value; {hint}")
         return numbers[value]
     exact = float(value) if raw else (value - item.offset) / item.scale

@@ -167,8 +167,10 @@ class WrittenRows(ABC):
         """
 
 
-def check_different(items: Sequence[str]) -> None:
-    """Raise ValueError if an item is named twice."""
+def check_different(items: Sequence[object]) -> None:
+    """Raise ValueError if an item is named twice, or if the names are in a list."""
+    if listed := next((name for name in items if isinstance(name, list | tuple)), None):
+        raise ValueError(f"{listed} is a list; give {', '.join(map(repr, listed))} without brackets")
     if twice := next((name for name in items if items.count(name) > 1), None):
         raise ValueError(f"{twice} is named twice")
 

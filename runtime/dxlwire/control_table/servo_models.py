@@ -31,6 +31,7 @@ def find_table(model: str, protocol: float | None = None) -> ControlTable:
     Raises:
         LookupError: The model is unknown, does not speak the protocol, or speaks both and none was given.
     """
+    model = str(model)  # of a script, which may give the model number
     if protocol is not None and (table := _table(model, protocol)) is not None:
         return table
     spoken = protocols_of(model)

@@ -202,6 +202,8 @@ def describe_failure(
 def _what_exists(path: str) -> str:
     if "/" not in path and os.path.exists(f"/dev/{path}"):
         return f"write /dev/{path}"
+    if path == "sim":  # in robot files this is a simulated bus
+        return "start simulated servos by `dxlrun sim --servo XM430-W350:1-3 --link ./bus`, and open ./bus"
     if re.fullmatch(r"COM\d+", path):
         return f"that is a port of Windows; {_devices()}"
     if "/" in path and not os.path.abspath(path).startswith("/dev/"):

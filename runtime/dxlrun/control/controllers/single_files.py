@@ -10,9 +10,11 @@ import re
 import sys
 import traceback
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from functools import cache
 from hashlib import sha256
 from importlib.abc import ExecutionLoader
+from pathlib import Path
 from types import ModuleType
 
 from msgspec.structs import replace
@@ -38,6 +40,18 @@ def file_of(type_name: str) -> str | None:
     """
     match = _TYPE.fullmatch(type_name)
     return match and match[1]
+
+
+def class_beside(folder: Path, type_name: str) -> str:
+    """Return the `type` that is meant by the name of a class in a Python file of a folder, such as `Wave` or
+    `wave.Wave`; empty if no file has this class.
+    """
+    name = re.split(r"\W", type_name)[-1]
+    for path in sorted(folder.glob("*.py")) if name else ():
+        with suppress(OSError):
+            if re.search(rf"^class {name}\b", path.read_text("utf-8", "replace"), re.MULTILINE):
+                return f"./{path.name}:{name}"
+    return ""
 
 
 def publisher_of(file: str, text: str) -> str:

@@ -210,6 +210,8 @@ class UnknownKeyContext(msgspec.Struct, frozen=True):
             fix = f"{how}: `{word}: {rest}`"
         elif not self.path and isinstance(value, str) and value.startswith(("/dev/", "COM")):
             fix = f"write it at a bus: `buses: {{main: {{port: {value}, ...}}}}`"
+        elif {"time", "joints"} <= {*self.known} - {*near(key, self.known)} and _UNIT.fullmatch(str(value)):
+            fix = f"write `joints: {{{key}: {{position: {value}}}}}`"
         elif key == "name" and named:
             fix = named
         elif folded(key) in _REMARKS and not near(key, self.known):
