@@ -168,6 +168,12 @@ def test_guardian_needs_neither_numpy_nor_pydantic() -> None:
     assert beneath(imported, "numpy", "pydantic", "yaml", "rich", "cyclopts", "importlib.metadata") == set()
 
 
+def test_a_run_is_begun_without_what_its_other_processes_do() -> None:
+    imported = set(printed("import json, sys, dxlrun.run.supervisor; print(json.dumps([*sys.modules]))"))
+    assert beneath(imported, "dxlrun.run.guardian") != set()
+    assert beneath(imported, "dxlrun.run.loop_process", "mcap.writer") == set()
+
+
 def test_every_name_is_there():
     assert len(dxlrun.__all__) > 30
     for name in dxlrun.__all__:

@@ -19,6 +19,8 @@ except ImportError:
 
 LOG_MODE = 0o640
 """Permissions of a new log file: only its user and group can read the clients' commands and names."""
+FOLDER_MODE = 0o750
+"""Permissions of a log's directory of parts, with the same rights as a log's file."""
 # Without locks, a file counts as being written for this time after its last change.
 _LATELY_S = 10.0
 _HELD = (errno.EWOULDBLOCK, errno.EACCES)

@@ -10,6 +10,7 @@ from pathlib import Path
 from msgspec.structs import replace
 
 from dxlrun.channels.ring import Payload, RecordKind
+from dxlrun.log.log_file import FOLDER_MODE
 from dxlrun.log.log_writer import LogWriter
 from dxlrun.log.schemas import CycleSpan, LogHeader, LogSummary
 from dxlrun.plan.recording_plan import (
@@ -18,9 +19,6 @@ from dxlrun.plan.recording_plan import (
     RecordingPlan,
     part_name,
 )
-
-FOLDER_MODE = 0o750
-"""Permissions of a log's directory of parts, with the same rights as a log's file."""
 
 
 def open_writer(path: Path, header: LogHeader, recording: RecordingPlan) -> LogWriter | PartWriter:

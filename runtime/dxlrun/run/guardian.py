@@ -33,7 +33,7 @@ from dxlrun.channels.child_processes import (
     RunMemory,
     Stop,
 )
-from dxlrun.channels.event_records import EventBody, EventRing, EventText
+from dxlrun.channels.event_records import CommandOutside, EventBody, EventRing, EventText, EventTotals
 from dxlrun.channels.heartbeat import Heartbeat, Phase, ProcessorTime, SimulationProgress
 from dxlrun.channels.logged_packets import PacketBatch, salvage
 from dxlrun.channels.ring import RingReader, RingWriter
@@ -43,6 +43,7 @@ from dxlrun.dynamixel.bus_part import SafeEnd
 from dxlrun.dynamixel.servo.torque_off import limp, stand
 from dxlrun.errors import PortError
 from dxlrun.features.feature import Feature
+from dxlrun.plan.machine_load import SimulationWait
 from dxlrun.plan.policy_plan import TORQUE_STAYS, Last
 from dxlrun.process_table import describe_run
 from dxlrun.run import texts
@@ -118,6 +119,28 @@ class LoopJob:
     guardian: int
     """Process ID of the guardian."""
     epoch_offset_ns: int = 0
+
+
+class LoopOutcome(msgspec.Struct, frozen=True):
+    """Result that the loop's process leaves in shared memory for the supervisor."""
+
+    reason: str
+    """Reason why the loop ended: ended, stopped, fault, or start-up (it could not start)."""
+    cycles: int = 0
+    skipped: int = 0
+    sentences: tuple[str, ...] = ()
+    """Errors for the user, one sentence each."""
+    remarks: tuple[str, ...] = ()
+    """Remarks for the user, one sentence each."""
+    traceback: str = ""
+    invalid: tuple[int, ...] = ()
+    """Number of cycles with an invalid servo state, a value for each joint."""
+    paused: int = 0
+    outside: tuple[CommandOutside, ...] = ()
+    events: EventTotals = EventTotals()
+    refused_for_replies: bool = False
+    """True when the start was refused because of late or missing replies."""
+    simulation_wait: SimulationWait = SimulationWait()
 
 
 class Started(msgspec.Struct, frozen=True, tag=True):

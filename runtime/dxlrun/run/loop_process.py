@@ -24,7 +24,7 @@ from msgspec.json import Decoder
 from dxlrun.channels import child_processes
 from dxlrun.channels.child_processes import LineLost, LineReturned, MessageChannel
 from dxlrun.channels.commands import CommandRing
-from dxlrun.channels.event_records import CommandOutside, EventRing, EventSink, EventTotals, SimulationStall
+from dxlrun.channels.event_records import EventRing, EventSink, SimulationStall
 from dxlrun.channels.heartbeat import GatewayAvailability, Heartbeat, Phase
 from dxlrun.channels.kept import KeptStates
 from dxlrun.channels.logged_packets import PacketBatch
@@ -45,7 +45,7 @@ from dxlrun.plan.policy_plan import TORQUE_STAYS
 from dxlrun.plan.robot_plan import Plan, from_json
 from dxlrun.run import texts
 from dxlrun.run.assembly import LoopHost, Sinks, assemble
-from dxlrun.run.guardian import LoopJob, make_ports
+from dxlrun.run.guardian import LoopJob, LoopOutcome, make_ports
 from dxlrun.run.process_watch import Duty, LoopWatch
 from dxlwire.clock import MonotonicClock
 from dxlwire.port.ports import (
@@ -54,28 +54,6 @@ from dxlwire.port.ports import (
     SerialPorts,
     StallCounter,
 )
-
-
-class LoopOutcome(msgspec.Struct, frozen=True):
-    """Result that the loop's process leaves in shared memory for the supervisor."""
-
-    reason: str
-    """Reason why the loop ended: ended, stopped, fault, or start-up (it could not start)."""
-    cycles: int = 0
-    skipped: int = 0
-    sentences: tuple[str, ...] = ()
-    """Errors for the user, one sentence each."""
-    remarks: tuple[str, ...] = ()
-    """Remarks for the user, one sentence each."""
-    traceback: str = ""
-    invalid: tuple[int, ...] = ()
-    """Number of cycles with an invalid servo state, a value for each joint."""
-    paused: int = 0
-    outside: tuple[CommandOutside, ...] = ()
-    events: EventTotals = EventTotals()
-    refused_for_replies: bool = False
-    """True when the start was refused because of late or missing replies."""
-    simulation_wait: SimulationWait = SimulationWait()
 
 
 def _keep_to_this_process(descriptors: Sequence[int]) -> None:

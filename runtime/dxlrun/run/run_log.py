@@ -20,8 +20,7 @@ from dxlrun.channels.kept import KeptStates
 from dxlrun.contract.hookspecs import CONTRACT_VERSION
 from dxlrun.errors import InputError
 from dxlrun.log.identity import IDENTITY_NAME, INCLUDED, MOTION, ROBOT, URDF, file_key, identity
-from dxlrun.log.log_file import LOG_MODE
-from dxlrun.log.part_writer import FOLDER_MODE
+from dxlrun.log.log_file import FOLDER_MODE, LOG_MODE
 from dxlrun.log.schemas import KEPT_ATTACHMENT, LogHeader
 from dxlrun.plan.recording_plan import PART_PATTERN, RecordingPlan
 from dxlrun.plan.robot_plan import Plan, to_json

@@ -27,8 +27,7 @@ from dxlrun.log.schemas import LogClosed, LogHeader, RecorderJob
 from dxlrun.plan.robot_plan import Plan, to_json
 from dxlrun.process_table import KIND
 from dxlrun.remote.job import Descriptors, GatewayJob
-from dxlrun.run.guardian import GuardianJob, GuardianMessage, GuardianPlan
-from dxlrun.run.loop_process import LoopOutcome
+from dxlrun.run.guardian import GuardianJob, GuardianMessage, GuardianPlan, LoopOutcome
 from dxlrun.run.simulation_front import first_message, start_simulation
 from dxlrun.run.source_process import SourceJob
 from dxlsim.messages import SimulationJob, SimulationMessage

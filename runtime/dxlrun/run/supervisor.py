@@ -44,9 +44,8 @@ from dxlrun.output.terminal import show_parts
 from dxlrun.plan.machine_load import MachineLoad
 from dxlrun.plan.robot_plan import Plan
 from dxlrun.run import source_process, texts
-from dxlrun.run.guardian import Ended, GuardianJob, GuardianMessage, SafeStop, Started
+from dxlrun.run.guardian import Ended, GuardianJob, GuardianMessage, LoopOutcome, SafeStop, Started
 from dxlrun.run.kept_files import KeptFiles, KeptStateWriter, read_states, state_directory
-from dxlrun.run.loop_process import LoopOutcome
 from dxlrun.run.process_watch import (
     GUARDIAN_TIMEOUT_NS,
     URGENT_TIMEOUT_NS,
