@@ -520,9 +520,10 @@ def test_a_clamp_has_one_event_at_its_beginning_and_one_after_its_end():
         "j0: goal lowered to the upper position limit; this ended after 0.1 s",
         "j0: goal raised to the lower position limit; this ended after 0.0 s",
     ]
-    rig.apply(position=3.0)
-    assert len(rig.texts) == 5
-    assert rig.gate.outside == (CommandOutside(0, 3.0, 5),)
+    for position in (3.0, -4.0, 3.5):
+        rig.apply(position=position)
+    assert len(rig.texts) == 6
+    assert rig.gate.outside == (CommandOutside(0, -4.0, 7),)
 
 
 LIGHT = SourcePlan(

@@ -386,8 +386,8 @@ class CommandOutside(msgspec.Struct, frozen=True):
 
     row: int
     """Row of the joint in the plan."""
-    first: float
-    """First such command, rad or m."""
+    farthest: float
+    """The one farthest outside, rad or m."""
     cycles: int
 
 

@@ -123,8 +123,8 @@ class Gate:
         self._joints = _laid_out(plan.joints)
         self.counts: NDArray[np.int64] = self._joints["counts"]
         self._begun, self._before = np.zeros((2, count), dtype=np.uint8)
-        self._outside: dict[int, float] = {}
-        """First position command outside of the limits, by row of the joint."""
+        self._outside: dict[int, tuple[float, float]] = {}
+        """Farthest position command outside of the limits, by row: distance from them, and command."""
         self._now_ns = 0  # Sum of the times between cycles
         self._clamps: dict[tuple[int, int], _ReportedClamp] = {}
         """Clamps whose begin was reported and whose end was not, by clamp bit and row of the joint."""
@@ -255,8 +255,6 @@ class Gate:
                 if (bit.value, row) in self._clamps:
                     continue
                 name = self._plan.joints[row].name
-                if bit in _POSITION_LIMITS:
-                    self._outside.setdefault(row, self._record.commands.position.item(row))
                 # A fallback may command the joint by now. The fault's own event names the controller.
                 owner = "" if bit is Clamp.NOT_FINITE else self._owner(name)
                 own = self._limited[row].find_servo_limit(_LIMITED[bit]) if bit in _LIMITED else None
@@ -268,13 +266,17 @@ class Gate:
     def outside(self) -> tuple[CommandOutside, ...]:
         """Joints with position commands outside of their limits."""
         cycles = self.counts[:, [bit.bit_length() - 1 for bit in _POSITION_LIMITS]].sum(axis=1)
-        return tuple(CommandOutside(row, first, cycles.item(row)) for row, first in self._outside.items())
+        return tuple(CommandOutside(row, far, cycles.item(row)) for row, (_, far) in self._outside.items())
 
     def _report_ended(self) -> None:
         bits = self._record.clamped
         for (bit, row), clamped in tuple(self._clamps.items()):
             if bits.item(row) & bit:
                 clamped.last_ns = self._now_ns
+                if bit in _POSITION_LIMITS:
+                    joint, at = self._plan.joints[row], self._record.commands.position.item(row)
+                    beyond = max(joint.lower - at, at - joint.upper), at
+                    self._outside[row] = max(beyond, self._outside.get(row, beyond))
             elif self._now_ns - clamped.last_ns >= CLAMP_ENDS_NS:
                 del self._clamps[bit, row]
                 name, lasted_ns = self._plan.joints[row].name, clamped.last_ns - clamped.begun_ns

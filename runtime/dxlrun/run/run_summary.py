@@ -211,10 +211,12 @@ def _commands_outside(run: RunSummary, plan: Plan) -> Iterator[str]:
     """Yield a sentence for each joint whose position commands were outside of its limits."""
     for one in run.outside[:_MOST]:
         joint, cycles = plan.loop.joints[one.row], counted(one.cycles, "cycle", "cycles")
-        yield (
-            f"{joint.name} was commanded to {one.first:.4g} {joint.unit.si}, outside of its limits "
-            f"{joint.lower:.4g}..{joint.upper:.4g} {joint.unit.si}; clamped in {cycles}."
-        )
+        farthest, lower, upper = (f"{value:.4g}" for value in (one.farthest, joint.lower, joint.upper))
+        if farthest not in (lower, upper):  # else at its limit within rounding
+            yield (
+                f"{joint.name} was commanded to {farthest} {joint.unit.si}, outside of its limits "
+                f"{lower}..{upper} {joint.unit.si}; clamped in {cycles}."
+            )
 
 
 def _rate(run: RunSummary, plan: Plan) -> tuple[bool, str]:
