@@ -213,15 +213,15 @@ static int64_t blocks_of(const Packets *packets, const Requests *requests, int64
     return count;
 }
 
-/* Return the kind of an exchange's first reply; `before` is the exchange before on any bus, -1 without one. */
-static int64_t first_kind(const Exchanges *exchanges, const Requests *requests, int64_t at, int64_t before)
+/* Return the kind of an exchange's first reply. */
+static int64_t first_kind(const Exchanges *exchanges, const Requests *requests, int64_t at)
 {
     int64_t request = exchanges->request[at];
-    if (requests->fast[request] || requests->servos[request] != 1 || before < 0 ||
-        exchanges->cycle[at] != exchanges->cycle[before]) {
+    if (requests->fast[request] || requests->servos[request] != 1 || at == 0 ||
+        exchanges->cycle[at] != exchanges->cycle[at - 1]) {
         return FIRST;
     }
-    return minus(exchanges->asked_ns[at], exchanges->last_ns[before]) > REST_NS ? RESTED : NEXT;
+    return minus(exchanges->asked_ns[at], exchanges->last_ns[at - 1]) > REST_NS ? RESTED : NEXT;
 }
 
 /* Return the number of replies in the packets. */
@@ -248,7 +248,7 @@ int64_t pairing_pair_replies(const Packets *packets, const Buses *buses, const R
     int64_t next = 0, reply = 0, begin = 0, lacking = 0;
     for (int64_t at = 0; at < exchanges->count; at++) {
         int64_t request = exchanges->request[at], bus = exchanges->bus[at], servos = requests->servos[request];
-        exchanges->answer[at] = -1, exchanges->kind[at] = first_kind(exchanges, requests, at, at - 1);
+        exchanges->answer[at] = -1, exchanges->kind[at] = first_kind(exchanges, requests, at);
         int64_t due_ns = exchanges->sent_ns[at], before_ns = due_ns, last_ns = due_ns, missing = servos, first = reply;
         for (int64_t place = 0; place < servos; place++) {
             due->exchange[begin + place] = at, due->place[begin + place] = place;

@@ -184,7 +184,7 @@ def await_sockets(robot: str | None) -> dict[str, Path]:
 
 
 def is_awaited(robot: str | None) -> bool:
-    """Return whether a client waits for a robot (None: any) that is starting on this computer."""
+    """Return whether a robot (None: any) is starting on this computer, so that a client waits for it."""
     # Imported here because a running robot is found without it.
     from dxlrun.channels.heartbeat import is_starting
     from dxlrun.process_table import found_runs, start_directories
