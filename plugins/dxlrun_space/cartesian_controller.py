@@ -177,7 +177,7 @@ class CartesianController(Controller[CartesianParameters]):
 
     @classmethod
     def mismatches(cls, parameters: CartesianParameters, robot: RobotModel) -> Iterator[Mismatch]:
-        """Yield a missing URDF, or a chain that the URDF does not have."""
+        """Yield a missing URDF, a chain that the URDF does not have, or poses that are always refused."""
         if robot.urdf is None:
             yield Mismatch("needs a URDF, but the robot file names none", "write `model: {urdf: NAME.urdf}`")
             return
@@ -198,6 +198,11 @@ class CartesianController(Controller[CartesianParameters]):
                 if joint is not None and (joint.type == "prismatic") != (unit is LINEAR):
                     what = f"needs {name} to be the same in both files, but it is {joint.type} in the URDF"
                     yield Mismatch(what, "correct its type in the URDF", name)
+            for name, pose in robot.poses.items() if _is_exact(parameters) else ():
+                if pose.remark and pose.positions.keys() == set(robot.joints):
+                    what = f"refuses pose {name}: it is {pose.remark}"
+                    fix = "give the pose another orientation, or write `orientation: nearest`"
+                    yield Mismatch(what, fix, "orientation")
         except WrongChain as wrong:
             yield Mismatch(f"cannot move the tip: {wrong.what}", wrong.fix, place + wrong.key)
         except InputError as error:
@@ -212,7 +217,7 @@ class CartesianController(Controller[CartesianParameters]):
             fix = "send it to a cartesian_controller without `leader`"
             raise ValueError(f"the tip follows a leader, so a {kind} is not accepted; {fix}")
         goal = cast("PoseCommand | TwistCommand", command).prepared(parameters.joints)
-        if isinstance(goal, TipGoal) and goal.remark and parameters.orientation == "exact":
+        if isinstance(goal, TipGoal) and goal.remark and _is_exact(parameters):
             raise ValueError(f"the pose is {goal.remark}; name another pose, or write `orientation: nearest`")
         return packed(goal)
 
@@ -246,7 +251,7 @@ class CartesianController(Controller[CartesianParameters]):
         )
         posture = [parameters.posture.get(joint) for joint in joints]
         self._solver = Solver(self._chain, limits.lower.tolist(), limits.upper.tolist(), posture)
-        self._exact = demands_orientation(parameters.orientation, len(joints))
+        self._exact = _is_exact(parameters)
         self._steps = min(MOST_STEPS, max(1, context.period_ns // STEP_NS))
         self._motion = TipMotion(self._solver, self._limits, exact=self._exact, steps=self._steps // 2 + 2)
         self._at: Positions = ()
@@ -561,6 +566,10 @@ class CartesianController(Controller[CartesianParameters]):
             self._report_hold(silence and f"no reply from leader {chain.joints[oldest]} {silence}, holding")
             self._at = motion.advance_joints(*twist, self._period_s)
             yield True
+
+
+def _is_exact(parameters: CartesianParameters) -> bool:
+    return demands_orientation(parameters.orientation, len(parameters.joints))
 
 
 def _remark(path: Path, asked: TipGoal) -> str:

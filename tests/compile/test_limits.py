@@ -109,6 +109,18 @@ joints:
 """
 
 
+def test_margin_of_a_pose_ignores_joints_without_limits(tmp_path: Path) -> None:
+    text = SPAN.format(protocol=2.0, model="XM430-W350", left=3, right=3)
+    poses = "poses: {turned: {left_arm_joint: 1 rad}, both: {left_arm_joint: 1 rad, right_arm_joint: 1 rad}}"
+    (tmp_path / "span.yaml").write_text(
+        text.replace("direction: 1}", "direction: 1, continuous: true}") + poses
+    )
+    compiled = compile_files(tmp_path / "span.yaml", {}, [])
+    assert [row["margin_joint"] for row in compiled.report["poses"]] == ["", "right_arm_joint"]
+    (table,) = (one for one in check._tables(compiled) if one.title == "Poses")
+    assert [row[1].text.rpartition(" ")[2] for row in table.rows] == ["", "right_arm_joint"]
+
+
 @pytest.mark.parametrize(
     "table", [table for table in all_tables() if not table.firmware], ids=lambda table: table.model
 )

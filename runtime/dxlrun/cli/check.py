@@ -208,7 +208,7 @@ _MOTIONS: Columns[Row] = [
 def _poses(poses: Sequence[Row]) -> Table:
     def margin(row: Row) -> str:
         unit = LINEAR if row["linear"] else ROTARY
-        return f"{unit.text(row['margin'])} of {row['margin_joint']}"
+        return f"{unit.text(row['margin'])} of {row['margin_joint']}" if row["margin_joint"] else ""
 
     def figure(name: str) -> tuple[Column, Callable[[Row], float | None]]:
         return Column(name, form="{:.2f}"), lambda row: row["figures"].get(name)

@@ -155,16 +155,18 @@ def _described(servo: DescribedServo) -> Row:
 
 
 def _pose(name: str, pose: SolvedPose, loop: LoopPlan) -> Row:
-    own = [(joint, pose.positions[joint.name]) for joint in loop.joints if joint.name in pose.positions]
-    margins = [min(at - joint.lower, joint.upper - at) for joint, at in own]
-    margin = min(margins)
-    nearest, _ = own[margins.index(margin)]
+    margins = [
+        (min(at - joint.lower, joint.upper - at), joint.name, joint.unit is LINEAR)
+        for joint in loop.joints
+        if joint.bounded and (at := pose.positions.get(joint.name)) is not None
+    ]
+    margin, nearest, linear = min(margins, default=(None, "", False))
     return {
         "name": name,
         **msgspec.structs.asdict(pose),
         "margin": margin,
-        "margin_joint": nearest.name,
-        "linear": nearest.unit is LINEAR,
+        "margin_joint": nearest,
+        "linear": linear,
     }
 
 

@@ -31,6 +31,7 @@ from dxlrun.description.document import KeyPath
 from dxlrun.description.mistakes.ros_types import ros_type
 from dxlrun.description.robot import ControllerEntry
 from dxlrun.errors import suggestion
+from dxlrun.features.feature import SolvedPose
 from dxlrun.plan.loop_plan import ControllerPlan, JointPlan, RegisterPlan
 from dxlwire.modes import CommandName
 
@@ -228,17 +229,21 @@ def compile_entry(
 
 
 def require_fit(
-    controller: CompiledController, own: Sequence[JointPlan], joints: Iterable[str], urdf: str | None
+    controller: CompiledController,
+    own: Sequence[JointPlan],
+    joints: Iterable[str],
+    urdf: str | None,
+    poses: Mapping[str, SolvedPose],
 ) -> None:
     """Raise WrongEntry if a controller cannot work on the robot: motor data, servos or URDF do not fit.
 
-    `own` are the controller's joints, `joints` the names of all, and `urdf` is the text of the URDF.
+    `own` are the controller's joints, `joints` the names of all, `urdf` is the text of the URDF, and `poses`
+    are those with names.
     """
     plan, offer = controller.plan, controller.offer
     with PlugInCode("controller", plan.name, offer.distribution).asked_to("compare itself with the robot"):
-        found = mismatches(
-            offer.controller, controller.parameters, controller.motors, own, robot_model(own, joints, urdf)
-        )
+        robot = robot_model(own, joints, urdf, poses)
+        found = mismatches(offer.controller, controller.parameters, controller.motors, own, robot)
     if found:
         start = ("controllers", plan.name)
         raise WrongEntry(

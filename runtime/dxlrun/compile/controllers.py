@@ -276,20 +276,20 @@ def _offer(file: RobotFile, name: str, type_name: str, plugins: PlugIns) -> Offe
 def check_robot(
     file: RobotFile,
     joints: Mapping[str, CompiledJoint],
-    urdf: str | None,
+    poses: Poses,
     controllers: Mapping[str, CompiledController],
 ) -> None:
-    """Add an error for each controller whose joints' motors or servos, or the URDF, do not meet its needs."""
+    """Add an error for each controller that does not suit the motors, servos, URDF or poses of the robot."""
     robot = file.robot
     plans = {name: joint.plan for name, joint in joints.items()}
     for controller in controllers.values():
         own = [plans[joint] for joint in controller.plan.joints if joint in plans]
         # An unusable motor file, joint or URDF has been reported.
         unread = [one for one in own if one.motor is None and _names_motor(joints[one.name])]
-        if unread or len(own) < len(controller.plan.joints) or (urdf is None and robot.model is not None):
+        if unread or len(own) < len(controller.plan.joints) or (poses.urdf is None and robot.model):
             continue
         try:
-            require_fit(controller, own, robot.joints, urdf)
+            require_fit(controller, own, robot.joints, poses.urdf, poses.named)
         except WrongEntry as wrong:
             _report(file, wrong)
 

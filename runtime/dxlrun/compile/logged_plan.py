@@ -90,7 +90,7 @@ def replan_controller(
     wrapping = {name for name, joint in joints.items() if joint.wrap}
     try:
         found = compile_entry(plan, offer, tuple(joints), wrapping=wrapping)
-        require_fit(found, [joints[joint] for joint in found.plan.joints], joints, urdf)
+        require_fit(found, [joints[joint] for joint in found.plan.joints], joints, urdf, {})
     except ValidationError as error:
         wrong = sentences_of(error, plan.name, offer.controller.Parameters, _MOST_SENTENCES)
         prefix = change.removesuffix(plan.name)

@@ -196,7 +196,7 @@ def compile_robot(
     check_source_names(file, by_feature, (one.plan for one in controllers.values()))
     check_limp_joints(file, (one.plan for one in controllers.values()))
     check_tolerances(file, joints, (one.plan for one in controllers.values()))
-    check_robot(file, joints, urdf, controllers)
+    check_robot(file, joints, poses, controllers)
     check_motions(file, joints, controllers)
     buses = compile_buses(file, joints, contributions, compile_modes(file, joints, controllers))
     mechanics = next((each.mechanics for each in contributions if each.mechanics), MechanicsPlan())

@@ -16,6 +16,7 @@ from dxlrun.channels.cycle import Commands, Floats, States
 from dxlrun.description.base_form import ParametersModel
 from dxlrun.description.joints.servo_model import ServoModel
 from dxlrun.errors import ControllerFault
+from dxlrun.features.feature import SolvedPose
 from dxlsim.motor_model import MotorModel
 from dxlwire.joint_unit import JointUnit
 from dxlwire.modes import CommandName
@@ -141,6 +142,8 @@ class RobotModel(msgspec.Struct, frozen=True):
     """Text of the robot's URDF; None: the robot file does not name one."""
     others: tuple[str, ...] = ()
     """All other joints of the robot, without those that the run omits."""
+    poses: Mapping[str, SolvedPose] = {}
+    """Poses by name."""
 
 
 class Mismatch(msgspec.Struct, frozen=True):

@@ -316,7 +316,7 @@ class Preparation:
         with plugin_code(plan.name, what, model):
             command = model.model_validate_json(body, strict=True)
             prepared = controller.prepare(kind, command, known.parameters)
-            robot = robot_model(known.joints, self.joints, self.urdf)
+            robot = robot_model(known.joints, self.joints, self.urdf, self.poses.named)
             controller.check_command(kind, command, known.parameters, robot)
             data = np.ascontiguousarray(prepared, dtype="<f8").tobytes()
             peaks = controller.speed_peaks(kind, np.frombuffer(data, "<f8"), known.parameters)
@@ -402,9 +402,8 @@ class Preparation:
                     groups=self.groups,
                     omitted=self.omitted,
                 )
-                require_fit(
-                    found, [self.joints[joint] for joint in found.plan.joints], self.joints, self.urdf
-                )
+                own = [self.joints[joint] for joint in found.plan.joints]
+                require_fit(found, own, self.joints, self.urdf, self.poses.named)
             if found.registers:
                 raise invalid(texts.registers_loaded(plan.name))
         except ValidationError as error:

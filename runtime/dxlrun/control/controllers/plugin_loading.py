@@ -27,6 +27,7 @@ from dxlrun.control.controllers.single_files import class_in_file, file_of, publ
 from dxlrun.description.base_form import ParametersModel
 from dxlrun.errors import ControllerFault, PlugInError
 from dxlrun.features import FEATURES, broken_features, stages
+from dxlrun.features.feature import SolvedPose
 from dxlrun.installed_plugins import GROUP, InstalledPlugin, distribution_name, installed_plugins
 from dxlrun.plan.loop_plan import ControllerPlan, JointPlan
 from dxlsim.motor_model import MotorModel
@@ -664,8 +665,10 @@ def mismatches(
     return list(controller.mismatches(parameters, robot))
 
 
-def robot_model(own: Sequence[JointPlan], joints: Iterable[str], urdf: str | None) -> RobotModel:
-    """Return a controller's view of its robot, from its own joints, the names of all, and the URDF."""
+def robot_model(
+    own: Sequence[JointPlan], joints: Iterable[str], urdf: str | None, poses: Mapping[str, SolvedPose]
+) -> RobotModel:
+    """Return a controller's view of its robot, from its own joints, the names of all, URDF and poses."""
     names = tuple(joint.name for joint in own)
     return RobotModel(
         names,
@@ -674,4 +677,5 @@ def robot_model(own: Sequence[JointPlan], joints: Iterable[str], urdf: str | Non
         tuple(joint.unit for joint in own),
         urdf,
         tuple(name for name in joints if name not in names),
+        poses,
     )
