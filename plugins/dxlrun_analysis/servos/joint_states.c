@@ -1,5 +1,5 @@
 /* Joint states: angle, speed and temperature of joints as bins, and the time in each bin. `joint_states.py` fills the
- * structs.
+ * structs. A log can contain any times, so sums of times wrap.
  */
 
 #include <math.h>
@@ -76,7 +76,8 @@ void joint_states_bin(const States *states, const Bins *bins)
                 double step = floor(values[quantity] / bins->step[quantity]) - bins->first[quantity];
                 double most = (double)(bins->bins - 1);
                 *bin = (int16_t)(step < 0 ? 0 : step > most ? most : step);
-                bins->time_ns[(joint * bins->quantities + quantity) * bins->bins + *bin] += states->period_ns[at];
+                int64_t *sum = bins->time_ns + (joint * bins->quantities + quantity) * bins->bins + *bin;
+                *sum = (int64_t)((uint64_t)*sum + (uint64_t)states->period_ns[at]);
             }
         }
     }
