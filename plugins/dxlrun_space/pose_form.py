@@ -111,7 +111,7 @@ def _solve(pose: TipPose, urdf: str | None, joints: Mapping[str, tuple[float, fl
     search = solver.search(target, start, exact=exact) if rotation else solver.search_place(target, start)
     found = finish_search(search)
     if not found.residual.suffices(exact):
-        fix = "move the pose, or give it another orientation"
+        fix = "move the pose, or give it another orientation" if exact else "move the pose"
         raise WrongChain("", out_of_reach(found.residual, exact), fix)
     return SolvedPose(
         dict(zip(chain.joints, found.positions, strict=True)),

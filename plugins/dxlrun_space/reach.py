@@ -42,7 +42,8 @@ def draw_reach(robot: RobotPath, tip: str, picture: Path, /, *assignments: Assig
     except WrongChain as wrong:
         raise InputError(str(wrong)) from None
     except KeyError as error:
-        raise InputError(f"{error.args[0]} moves {tip}, but has no servo; add it to `joints`") from None
+        fix = "run with it, or add it to `joints`"
+        raise InputError(f"{tip} needs {error.args[0]}, which is omitted or has no servo; {fix}") from None
     places, found = dexterity(chain, spread(lower, upper, POSTURES).tolist())
     places *= 1e3
     write_target(picture, _drawn(places, found, f"{tip} of {plan.robot}", picture.suffix[1:]))

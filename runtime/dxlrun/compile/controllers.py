@@ -260,14 +260,12 @@ def _offer(file: RobotFile, name: str, type_name: str, plugins: PlugIns) -> Offe
     offer = plugins.controllers.get(type_name)
     if offer is None and is_of_file(type_name) and not ros and type_name not in plugins.broken:
         return None  # the unreadable file has been reported
-    known = offer is not None or ros or is_of_file(type_name)
-    if not known and (meant := class_beside(file.description.path.parent, type_name)):
-        what = f"no plug-in offers the controller type {type_name} of {name}"
-        file.error(file.at("controllers", name, "type"), what, f"write {meant}")
-        return None
     try:
         return find_offer(name, type_name, plugins)
     except WrongEntry as wrong:
+        folder, other = file.description.path.parent, ros or is_of_file(type_name)
+        if not other and (meant := class_beside(folder, type_name)):
+            wrong = WrongEntry(*(replace(one, fix=f"write {meant}") for one in wrong.mistakes))
         _report(file, wrong)
     # return dxlrun's type, so that the parameters are checked, too
     return plugins.controllers.get(ros[2]) if ros else None

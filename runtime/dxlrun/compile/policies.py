@@ -40,14 +40,13 @@ def compile_poses(file: RobotFile, joints: Mapping[str, CompiledJoint], urdf: st
     plans = {name: joint.plan for name, joint in joints.items()}
     wrong = len(plans) < len(file.robot.joints) or (urdf is None and file.robot.model is not None)
     poses = Poses({}, plans, file.description.omitted, urdf, wrong)
-    named = dict.fromkeys(file.description.omitted_poses, SolvedPose({}))
+    named = dict.fromkeys([*file.description.omitted_poses, *file.robot.poses], SolvedPose({}))
     mistaken = set[str]()
     for name, written in file.robot.poses.items():
         if isinstance(written, dict):
             _check_pose(file, name, written, joints)
             named[name] = SolvedPose({joint: float(at) for joint, at in written.items()})
             continue
-        named[name] = SolvedPose({})
         try:
             named[name] = poses.solve_pose(written)
         except WrongPose as error:

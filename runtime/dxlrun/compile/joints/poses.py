@@ -81,10 +81,9 @@ class Poses(msgspec.Struct, frozen=True):
         if self.has_mistakes:
             raise WrongPose
         solve = next(one.solve for one in pose_stages() if isinstance(pose, one.form))
+        limits = {name: (joint.lower, joint.upper) for name, joint in self.joints.items()}
         try:
-            return solve(
-                pose, self.urdf, {joint.name: (joint.lower, joint.upper) for joint in self.joints.values()}
-            )
+            return solve(pose, self.urdf, limits)
         except KeyError as error:
             joint = str(error.args[0])
             what = f"the pose needs {joint}, which is omitted or has no servo"

@@ -152,21 +152,16 @@ class UnknownKeyContext(msgspec.Struct, frozen=True):
     def _renamed(self, meaning: _Meaning, word: str, value: object) -> str:
         """Return the fix that replaces a foreign term by dxlrun's key, with its value converted."""
         place, key = meaning.place, meaning.place[0]
+        is_same = len(place) == 1 and not meaning.kind
         if key in self.present and len(place) == 1:
-            if not meaning.kind and (elsewhere := places_of(self.root, folded(word), value)):
+            if is_same and (elsewhere := places_of(self.root, folded(word), value)):
                 return self._moved(folded(word), value, elsewhere)
             return f"remove it, or `{key}`: both mean the same"
-        if (
-            isinstance(value, dict | list)
-            and key in keys_for(self.form, value)
-            and not meaning.kind
-            and key not in self.present
-            and len(place) == 1
-        ):
+        if is_same and isinstance(value, dict | list) and key in keys_for(self.form, value):
             return f"rename it to `{key}`"
         example = example_at(self.form, place)
         converted = _CONVERSIONS.get(meaning.kind or ".".join(place), _plain)(value, example)
-        if example.startswith("{") and not isinstance(value, dict) and len(place) == 1 and not meaning.kind:
+        if is_same and example.startswith("{") and not isinstance(value, dict):
             converted = None
         text, condition = converted or (example, "")
         such = "write" if converted is not None else "write for example"
