@@ -212,10 +212,16 @@ class VirtualRun(VirtualRobot):
 
     def finish(self) -> Log:
         """Run to the end of the plan, and replay the run without a difference; return the log."""
+        path = self.ended()
+        assert self.failures == ()
+        return replayed(path)
+
+    def ended(self) -> Path:
+        """Run to the end of the plan; return the path of the log."""
         path = self.logged()
         assert self.result is not None
-        assert (self.result.reason, self.result.detail, self.failures) == ("ended", "", ())
-        return replayed(path)
+        assert (self.result.reason, self.result.detail) == ("ended", "")
+        return path
 
     def logged(self) -> Path:
         """Run, however it ends; return the path of the log."""

@@ -82,7 +82,7 @@ def turned(tmp_path: Path) -> Callable[..., Log]:
         (tmp_path / "gimbal.urdf").write_text(URDF)
         motion, text = tmp_path / "turn.yaml", ROBOT.format(errors=errors, keys=keys, physics=physics)
         motion.write_text(MOTION.format(yaw=pose[0], pitch=pose[1], roll=pose[2]))
-        return read_log(VirtualRun.of_text(tmp_path, text, duration_s, play=[motion]).logged())
+        return read_log(VirtualRun.of_text(tmp_path, text, duration_s, play=[motion]).ended())
 
     return run
 

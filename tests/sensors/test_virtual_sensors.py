@@ -174,7 +174,7 @@ IMU = "{type: simulated_imu, link: tip}"
 
 def run(path: Path, log: Path, positions: tuple[float, float], seconds: float = 2.0) -> Log:
     asked = {0: [send("arm", "position", *positions)]}
-    return read_log(VirtualRun(path, log, asked, duration_s=seconds).logged())
+    return read_log(VirtualRun(path, log, asked, duration_s=seconds).ended())
 
 
 @pytest.mark.parametrize(
