@@ -300,9 +300,10 @@ class Story(VirtualRun):
         return number, self.inbox.answers.get(number)
 
     def refused(self, earlier: str | None, code: str, text: str | None) -> object:
+        """Compare a refusal with its code and a part of its text, behind which its fields are."""
         _, found = self.next_answer(earlier)
-        fits = isinstance(found, Refusal) and found.code == code and (text or "") in found.text
-        return None if fits else found
+        fits = isinstance(found, Refusal) and found.code == code
+        return None if fits and (text or "") in f"{found.text} {found.fields}" else found
 
     def done(self, earlier: str | None, text: str | None) -> object:
         _, found = self.next_answer(earlier)
