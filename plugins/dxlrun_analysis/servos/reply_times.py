@@ -109,10 +109,8 @@ class ReplyTimes:
         whole, extra_ns = whole[late], extra_ns[late]
         answers = np.flatnonzero(replies.answers & np.isin(replies.exchange, whole))
         # Of equal exchanges, the last counts: the one with the slowest reply.
-        of, order = (
-            replies.exchange[answers],
-            np.lexsort((replies.own_ns[answers], replies.exchange[answers])),
-        )
+        of = replies.exchange[answers]
+        order = np.lexsort((replies.own_ns[answers], of))
         slowest = answers[order][np.searchsorted(of, whole, side="right") - 1]
         lacks, first = np.unique(given_up[0], return_index=True)
         rows = np.append(whole, lacks)

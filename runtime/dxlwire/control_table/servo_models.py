@@ -88,7 +88,7 @@ def model_names(protocol: float | None = None) -> tuple[str, ...]:
 def perhaps_meant(name: str, protocol: float | None = None) -> str:
     """Return a hint for an unknown servo model name, such as `did you mean ...?`."""
     protocols = (1.0, 2.0) if protocol is None else (protocol,)
-    numbered = [models_by_number(int(name), each)[:1] for each in protocols if name.isdecimal()]
+    numbered = [models_by_number(int(name), each)[:1] for each in protocols if re.fullmatch(r"\d{1,5}", name)]
     if models := [table.model for tables in numbered for table in tables]:
         return f"write {' or '.join(models)}, the name of this model number"
     return beginning_or_near(name, model_names(protocol))
