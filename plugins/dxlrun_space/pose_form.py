@@ -31,7 +31,7 @@ def at_most_a_turn(value: float) -> float:
 def check_turns(quaternion: tuple[float, ...] | None, *others: tuple[float, ...] | None) -> None:
     """Raise ValueError for more than one orientation, or a quaternion that is not of length 1."""
     if sum(each is not None for each in (quaternion, *others)) > 1:
-        raise ValueError("give only one of rpy, drpy and quaternion; remove the others")
+        raise ValueError("several orientations are given; keep one")
     if quaternion is not None and abs(math.hypot(*quaternion) - 1) > NORM:
         raise ValueError(f"the quaternion has length {math.hypot(*quaternion):.4g}; scale it to length 1")
 

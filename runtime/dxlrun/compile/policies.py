@@ -12,7 +12,8 @@ from dxlrun.compile.joints.limits import Interval, degrees, limits_of
 from dxlrun.compile.joints.poses import Poses, WrongPose
 from dxlrun.compile.problems import RobotFile
 from dxlrun.description.document import KeyPath
-from dxlrun.description.robot import PoseStep, TorqueStep, WrittenPolicy
+from dxlrun.description.mistakes.forms import example_at
+from dxlrun.description.robot import PoseStep, TorqueStep, WrittenPolicy, pose_stages
 from dxlrun.description.units import Measure
 from dxlrun.errors import suggestion
 from dxlrun.features.feature import PolicyKey, SolvedPose
@@ -93,7 +94,11 @@ def _check_pose(
         if joint not in known:
             mark = file.key("poses", pose, joint)
             what = f"joint {joint} of pose {pose} is not defined"
-            file.error(mark, what, suggestion(joint, known))
+            forms = (one for one in pose_stages() if joint in one.form.model_fields)
+            meant = [
+                f"add `{one.name}: {example_at(one.form, (one.name,))}`, or remove {joint}" for one in forms
+            ]
+            file.error(mark, what, suggestion(joint, known, *meant[:1]))
         elif joint in joints:
             plan = joints[joint].plan
             allowed, mark = limits_of(plan), file.at("poses", pose, joint)

@@ -360,20 +360,19 @@ def pose_stages() -> list[PoseStage[Any]]:
 def pose_form() -> object:
     """Return the pydantic type of a pose: positions by joint, or the form of a feature.
 
-    A pose in the form of a feature has the feature's key, or a foreign term for it, with a text that is not a
-    quantity.
+    A pose in the form of a feature has a text that is not a quantity: with the feature's key or a foreign
+    term for it, or next to another key of the form.
     """
     forms = pose_stages()
-    tags = {
-        word: f"<{one.name}>"
-        for one in forms
-        for word in (one.name, *words_for(one.form.__name__, [one.name]))
-    }
 
     def kind_of_pose(pose: object) -> str:
-        values = pose.items() if isinstance(pose, dict) else ()
-        texts = (key for key, at in values if isinstance(at, str) and split_quantity(at) is None)
-        return next((tags[key] for key in texts if key in tags), "<joints>")
+        values = pose if isinstance(pose, dict) else {}
+        texts = {key for key, at in values.items() if isinstance(at, str) and split_quantity(at) is None}
+        for one in forms:
+            keys, named = one.form.model_fields.keys(), {one.name, *words_for(one.form.__name__, [one.name])}
+            if texts & named or (texts - keys and values.keys() & keys):
+                return f"<{one.name}>"
+        return "<joints>"
 
     by_joint = Annotated[dict[Name, Position], Field(min_length=1), Tag("<joints>")]
     others = (Annotated[one.form, Tag(f"<{one.name}>")] for one in forms)
