@@ -185,6 +185,7 @@ def test_counts_and_events_of_a_run_make_its_verdict(
     rest = iter(lines)
     assert [one for one in shown[1:] if not any(one in line for line in rest)] == [], said.out
     assert ("machine" in said.out) == (" machine " in " ".join(shown))
+    assert said.out.count("outside") == " ".join(shown).count("outside")
 
 
 @pytest.mark.parametrize(
