@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from functools import partial
+from textwrap import shorten
 
 from dxlrun import JointUnit
 from dxlrun.tooling.output import counted
@@ -43,7 +45,8 @@ _REASONS = {
 Missed goals have a clause of their own."""
 _RELEASED = "torque off: "
 _FACTS = (Rank.NEVER_RAN, Rank.LINE, Rank.SERVO, Rank.SHARE, Rank.ERROR, Rank.LOG)
-_LONGEST = 100  # Characters of a reason
+_shortened = partial(shorten, width=100, placeholder=" ...")
+"""Returns a reason that is cut after a word."""
 
 
 def robot_line(totals: RunTotals, word: str, found: Sequence[Finding]) -> Finding:
@@ -78,7 +81,7 @@ def _reason(worst: Finding) -> str:
     words = f"{worst.subject}: {worst.code.replace('_', ' ')}"
     sentence = f"{worst.sentence[:1].lower()}{worst.sentence[1:-1]}"
     reason = _REASONS.get(worst.code, words)
-    return reason.format(subject=worst.subject, text=text[:_LONGEST], sentence=sentence)
+    return reason.format(subject=worst.subject, text=_shortened(text), sentence=sentence)
 
 
 def _failures(totals: RunTotals) -> Iterator[str]:
@@ -158,7 +161,7 @@ def _takeovers(totals: RunTotals) -> Iterator[str]:
     yield from (f"{name} failed" for name in totals.conduct.unanswered[:_MOST_NAMED])
     for one in [one for one in totals.conduct.takeovers if not one.fell][:_MOST_NAMED]:
         if one.by:
-            why = one.text.partition("\n")[0].removeprefix(f"controller {one.controller} ")[:_LONGEST]
+            why = _shortened(one.text.partition("\n")[0].removeprefix(f"controller {one.controller} "))
             yield f"{one.controller} failed ({why}) and fell back to {one.by} at {one.time_s:.1f} s"
         else:
             yield f"at {one.time_s:.1f} s {one.text}"
