@@ -6,12 +6,10 @@
 #define SOURCE_CRC 0 /* CRC-32 of this file: counts.py rejects an object of another version */
 #endif
 
-#define GROUP 40 /* low bits of a key hold the value, shifted to be non-negative; the bits above hold its group */
-#define ZERO ((int64_t)1 << (GROUP - 1))
-
 typedef struct {
     int64_t *keys, *counts; /* shape (slots,); a slot with a count of 0 is free */
     int64_t slots, used;    /* a power of two; slots that are not free */
+    int64_t bits;           /* low bits of a key, which hold a value as its distance from the least one */
 } Table;
 
 uint32_t dxl_source(void)
@@ -34,11 +32,11 @@ static void add_key(Table *table, int64_t key, int64_t count)
  * the table was half full. */
 int64_t counts_add(Table *table, const int64_t *groups, const int64_t *values, int64_t count)
 {
-    int64_t at = 0;
+    int64_t at = 0, half = (int64_t)1 << (table->bits - 1); /* values from -half to half - 1 */
     for (; at < count && 2 * table->used < table->slots; at++) {
-        int64_t value = values[at] < -ZERO ? -ZERO : values[at] > ZERO - 1 ? ZERO - 1 : values[at];
+        int64_t value = values[at] < -half ? -half : values[at] > half - 1 ? half - 1 : values[at];
         if (groups[at] >= 0) {
-            add_key(table, (groups[at] << GROUP) + value + ZERO, 1);
+            add_key(table, (groups[at] << table->bits) + value + half, 1);
         }
     }
     return at;

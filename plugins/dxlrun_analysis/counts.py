@@ -19,7 +19,7 @@ Numbers = NDArray[np.int64]
 
 SOURCE = Path(__file__).with_name("counts.c")
 _TABLE = parse_structs(SOURCE.read_text())["Table"]
-_GROUP = 40  # Layout of a key as in counts.c
+_GROUP = 40  # Low bits of a key hold the value, shifted to be non-negative; the bits above hold its group
 _ZERO = 1 << (_GROUP - 1)
 _FEWEST_SLOTS = 1 << 10
 _FEWEST = 10  # Fewer occurrences can be a coincidence
@@ -36,13 +36,13 @@ class Counts:
     def _resize(self, slots: int) -> None:
         self._slots = np.zeros((2, slots), np.int64)  # Keys and counts
         keys, counts = (row.ctypes.data for row in self._slots)
-        self._table = _TABLE(keys=keys, counts=counts, slots=slots)
+        self._table = _TABLE(keys=keys, counts=counts, slots=slots, bits=_GROUP)
 
     def count_values(self, group: Numbers, value: Numbers) -> None:
         """Count values in their groups.
 
         Args:
-            group: Group of each value, 0 to 2^23, or less than 0 to skip it; shape (values,).
+            group: Group of each value, 0 to 2^22, or less than 0 to skip it; shape (values,).
             value: Values to count; shape (values,).
         """
         self._sorted, done = None, 0
