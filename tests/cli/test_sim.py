@@ -131,7 +131,7 @@ def test_robot_runs_against_it_as_against_a_real_one(start: Start, torso: Path, 
     assert hint == f"next: dxlrun {torso} port:={tmp_path / 'torso'}"
     command = [*PROGRAM, *hint.split()[2:], "rate:=20", "--duration", "0.5", "--no-record"]
     ran = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
-    assert ran.returncode == 0, ran.stderr
+    assert ran.returncode == 0, ran.stdout + ran.stderr
     assert "bioloid_torso: " in ran.stdout
     code, out, err = sim.stop()
 
