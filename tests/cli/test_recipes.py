@@ -122,12 +122,18 @@ def test_walk_with_one_arm_limp(
 
 
 @pytest.fixture(scope="module")
-def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveRobot]:
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveRobot]:
     directory = tmp_path_factory.mktemp("live")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_RUNTIME_DIR", str(directory))
         with LiveRobot(directory, ROOT / "robots" / "bioloid_torso.yaml") as live:
             yield live
+
+
+@pytest.fixture
+def live(shared: LiveRobot) -> LiveRobot:
+    shared.restart()
+    return shared
 
 
 def test_log_a_value(run: Run, live: LiveRobot, tmp_path: Path) -> None:

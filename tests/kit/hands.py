@@ -143,6 +143,8 @@ class LiveRobot:
         return self
 
     def __exit__(self, *_: object) -> None:
+        if self._run is not None and self._run.poll() is not None:
+            print(self._said.read_text())  # pytest shows beside a failed test why the robot ended
         for process in filter(None, (self._run, self._servos)):
             process.terminate()
             try:
