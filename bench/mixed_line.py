@@ -1,4 +1,4 @@
-"""How many instructions AX-12A miss on a line with an XL430: why a bus has one protocol.
+"""Counts the instructions that an AX-12A misses on a line with an XL430, for which a bus has one protocol.
 
     python bench/mixed_line.py [--reads 1000000]
 

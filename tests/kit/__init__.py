@@ -1,4 +1,4 @@
-"""What many rooms of tests need; a module has one subject.
+"""Helpers that several rooms of tests use. Each module has one subject.
 
 whole robots          virtual_run, and in processes live_run and torso
 one part of a robot   loops, stages, laws, rigs, plans, bodies

@@ -119,7 +119,7 @@ EVENTS: dict[str, Callable[..., None]] = {
     r"poke servo=(\d+) (\w+) (-?\d+)(?: at=(\d+)ms)?": poke,
     r"at ([\d.]+) (?:(\w+) )?(\w+) (\{.*\})(?: for ([\d.]+) s)?": request,
 }
-"""What happens in a run."""
+"""Function that makes each event of a story, by the pattern of its line."""
 
 
 class Story:

@@ -1,4 +1,4 @@
-"""What the analysis counts of a log, and a line of what its verdict says."""
+"""Totals: the counts that the analysis makes of a log, and the check of a line about its verdict."""
 
 import re
 from pathlib import Path

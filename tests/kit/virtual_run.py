@@ -116,7 +116,7 @@ class VirtualRun(VirtualRobot):
             for servo in planned_bus.servos
         ]
         self.servos: dict[str, SimulatedServo] = dict(placed)
-        """By the names of joints; of a joint with several servos the last one."""
+        """Servo of each joint, by name; the last one of a joint with several servos."""
         self.rows = {joint.name: row for row, joint in enumerate(plan.loop.joints)}
         self._times: list[float] = []
         self._angles: dict[SimulatedServo, list[float]] = {}

@@ -1,6 +1,6 @@
-"""What is on the wire of a simulated bus, by its ledger, taken apart by code of this file alone.
+"""Packets on the wire of a simulated bus, read from its ledger without code of the runtime.
 
-Addresses and units too are those of FACTS, from the e-Manual, and not the runtime's.
+Addresses and units are those of FACTS, from the e-Manual.
 """
 
 import math

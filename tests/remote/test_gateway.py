@@ -3,14 +3,12 @@
 import asyncio
 import json
 import signal
-import time
 from string import Formatter
 
 import msgspec
 import numpy as np
 import pytest
 from msgspec.structs import replace
-from tests.kit.awaited import DEADLINE_S
 from tests.kit.commands import matches
 from tests.kit.pages import page_text
 from tests.remote.conftest import Arm, Desk
@@ -487,7 +485,7 @@ def test_a_plug_in_that_never_returns_is_interrupted_and_the_next_client_is_serv
 
 def test_poses_that_take_long_are_interrupted(monkeypatch):
     monkeypatch.setattr(preparation, "BUDGET_S", 0.05)
-    monkeypatch.setattr(Poses, "find_pose", lambda *_: time.sleep(DEADLINE_S))
+    monkeypatch.setattr(Poses, "find_pose", lambda *_: signal.pause())
     motions = {"a": {"steps": [{"time": "1 s", "pose": "rest"}]}}
     entry = {"name": "more", "type": "keyframe_player", "joints": ["pan"], "motions": motions}
     status, content = Desk(offered=load_plugins()).ask("POST", "/controllers", entry)

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from functools import cache, reduce
 from operator import or_
+from types import GenericAlias
 from typing import Annotated, Any, ClassVar, Literal, get_args
 
 from pydantic import (
@@ -387,6 +388,6 @@ def robot_form() -> type[Robot]:
     return with_keys(
         Robot,
         [Section("policies", policies, key(*_POLICIES, policies.of_defaults())), *sections],
-        joints=dict[Name, joint_form()],  # type: ignore[misc]  # made at run time
-        poses=dict[Name, pose_form()],  # type: ignore[misc]  # as above
+        joints=GenericAlias(dict, (Name, joint_form())),
+        poses=GenericAlias(dict, (Name, pose_form())),
     )
