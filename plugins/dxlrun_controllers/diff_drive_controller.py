@@ -31,7 +31,7 @@ from dxlrun import (
     LinearVelocity,
     ParametersModel,
 )
-from dxlrun.messages import Header, Odometry
+from dxlrun.tooling.topics import messages
 from dxlrun_controllers.joint_parameters import JointNames, or_number
 from dxlrun_controllers.laws.odometry import BasePose, WheelAngles
 
@@ -176,7 +176,7 @@ class DiffDriveController(Controller[DiffDriveParameters]):
 
     Parameters = DiffDriveParameters
     Commands: ClassVar = {"velocity": VelocityCommand}
-    Topics: ClassVar = {"odometry": Odometry}
+    Topics: ClassVar = {"odometry": messages.Odometry}
 
     @classmethod
     def interfaces(cls, parameters: DiffDriveParameters, joints: tuple[str, ...]) -> Interfaces:
@@ -193,8 +193,8 @@ class DiffDriveController(Controller[DiffDriveParameters]):
         self._sides = slice(None, left), slice(left, None)
         self._linear, self._angular = Ramp(parameters.linear), Ramp(parameters.angular)
         self._pose = BasePose()
-        self._message = Odometry(
-            header=Header(frame_id=parameters.frame), child_frame_id=parameters.child_frame
+        self._message = messages.Odometry(
+            header=messages.Header(frame_id=parameters.frame), child_frame_id=parameters.child_frame
         )
         self._twist = (0.0, 0.0)
         self._command = self._target = (0.0, 0.0)

@@ -19,7 +19,7 @@ from dxlrun import (
     Interfaces,
     Mistake,
 )
-from dxlrun.messages import Header
+from dxlrun.tooling.topics import messages
 from dxlrun_controllers.joint_parameters import (
     JointsParameters,
     PerJoint,
@@ -72,7 +72,7 @@ class FeedForwardParameters(JointsParameters):
 class FeedForwardState:
     """Message of the topic `state`: the feed-forward, with one row per joint of the controller."""
 
-    header: Header
+    header: messages.Header
     velocity: Floats
     """Desired velocity, rad/s. Like all fields that follow, it is predicted for the time when the goal acts.
     """
@@ -147,7 +147,7 @@ class FeedForward(Controller[FeedForwardParameters]):
         self._reference, self._output = np.zeros((2, count))
         ahead, inverse = self._ahead, self._inverse
         self._state = FeedForwardState(
-            Header(),
+            messages.Header(),
             ahead.velocity,
             ahead.acceleration,
             inverse.torque,

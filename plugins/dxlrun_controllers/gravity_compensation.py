@@ -26,7 +26,7 @@ from dxlrun import (
     ParametersModel,
     RobotModel,
 )
-from dxlrun.messages import Header
+from dxlrun.tooling.topics import messages
 from dxlrun_controllers.joint_parameters import (
     JointsParameters,
     PerJoint,
@@ -79,7 +79,7 @@ class GravityParameters(JointsParameters):
 class GravityState:
     """Message of the topic `state`: the compensated weight, with one row per joint of the controller."""
 
-    header: Header
+    header: messages.Header
     torque: Floats
     """Torque that holds the weight, Nm."""
     output: Floats
@@ -169,7 +169,7 @@ class GravityCompensation(Controller[GravityParameters]):
         self._reference, self._torque, self._output = np.zeros((3, count))
         # Velocity of `posvel` without a reference. A servo needs one above 0 to reach its goal position.
         self._rest = np.zeros(count) if context.into else finite_or(limits.velocity, 1.0)
-        self._state = GravityState(Header(), self._torque, self._output)
+        self._state = GravityState(messages.Header(), self._torque, self._output)
         self.on_parameters(0)
 
     def on_parameters(self, time_ns: int) -> None:

@@ -19,7 +19,7 @@ from dxlrun import (
     Interfaces,
     Mistake,
 )
-from dxlrun.messages import Header
+from dxlrun.tooling.topics import messages
 from dxlrun_controllers.group import PositionsCommand, VelocitiesCommand
 from dxlrun_controllers.joint_parameters import (
     JointsParameters,
@@ -78,7 +78,7 @@ class PidState:
     controller.
     """
 
-    header: Header
+    header: messages.Header
     reference: Floats
     """Reference in rad or rad/s; `measurement` and `error` have the same unit."""
     measurement: Floats
@@ -168,7 +168,7 @@ class PidController(Controller[PidParameters]):
         self._chained = np.zeros(count, dtype=np.bool_)
         law = self._pid
         self._state = PidState(
-            Header(),
+            messages.Header(),
             self._reference,
             self._measurement,
             self._error,

@@ -21,7 +21,7 @@ from dxlrun import (
     RobotModel,
     ServoModel,
 )
-from dxlrun.messages import Header
+from dxlrun.tooling.topics import messages
 from dxlrun_controllers.joint_parameters import (
     JointsParameters,
     PerJoint,
@@ -69,7 +69,7 @@ class ThermalParameters(JointsParameters):
 class ThermalState:
     """Message of the topic `state`: temperatures and limits, with one row per joint of the controller."""
 
-    header: Header
+    header: messages.Header
     temperature: Floats
     """Measured temperature, degrees C; NaN until first read."""
     scale: Floats
@@ -138,7 +138,7 @@ class ThermalGovernor(Controller[ThermalParameters]):
         self._temperature = np.full(count, np.nan)
         self._reference, self._scale = np.zeros((2, count))
         self._is_hot, self._is_spent = np.zeros((2, count), dtype=np.bool_)
-        self._state = ThermalState(Header(), context.states.temperature, self._scale)
+        self._state = ThermalState(messages.Header(), context.states.temperature, self._scale)
 
     def on_activate(self, time_ns: int) -> None:
         """Start from the measured temperatures, and discard references, so that joints hold where they

@@ -23,9 +23,8 @@ from dxlrun_fleet.fleet_file import Agent
 
 START = "/robots/"
 """Path prefix before a robot's name. POST starts the robot; GET returns 200 if it runs."""
+_MAIN = ("-m", "dxlrun")
 _MOST_TOLD, _LINES_TOLD = 4096, 6  # Bytes and lines of a run's output in an answer
-# Program of `python -c` that runs the `dxlrun` command
-_MAIN = "from dxlrun.cli import main; raise SystemExit(main())"
 
 
 class AgentApp:
@@ -72,7 +71,7 @@ class AgentApp:
             self._runs.append(
                 subprocess.Popen(
                     # -P keeps modules in the fleet's directory from shadowing installed ones.
-                    [sys.executable, "-P", "-c", _MAIN, *self._agent.starts[name]],
+                    [sys.executable, "-P", *_MAIN, *self._agent.starts[name]],
                     stdin=subprocess.DEVNULL,
                     stdout=output,
                     stderr=output,

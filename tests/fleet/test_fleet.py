@@ -105,7 +105,7 @@ def test_what_an_agent_answers(tmp_path, monkeypatch):
     (tmp_path / "wait.py").write_text(
         "import sys\nprint(sys.argv[1:], flush=True)\nsys.stdin.read()\ninput()\n"
     )
-    monkeypatch.setattr("dxlrun_fleet.agent._MAIN", (tmp_path / "wait.py").read_text())
+    monkeypatch.setattr("dxlrun_fleet.agent._MAIN", ("-c", (tmp_path / "wait.py").read_text()))
     first, second = (AgentApp(Agent(ADDRESS, {"arm": ("arm.yaml", "port:=x")}), tmp_path) for _ in range(2))
     for method, path, role, status in (
         ("POST", START + "arm", Role.COMMAND, 403),
@@ -128,7 +128,7 @@ def test_what_an_agent_answers(tmp_path, monkeypatch):
     assert (head, last) == (f"not running; {out} ends with:", "EOFError: EOF when reading a line")
     assert out.read_text().startswith("['arm.yaml', 'port:=x']\n")
 
-    monkeypatch.setattr("dxlrun_fleet.agent._MAIN", "import time; time.sleep(3600)")
+    monkeypatch.setattr("dxlrun_fleet.agent._MAIN", ("-c", "import time; time.sleep(3600)"))
     assert first.answer_request("POST", START + "arm", Role.ADMIN)[0] == 200
     assert out.read_text() == ""
     for starter in (first, second):

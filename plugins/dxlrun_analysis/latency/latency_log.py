@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun import LogError, LogReader
-from dxlrun.messages import Number
 from dxlrun.tooling.logs import LogSummary, TopicWriter
+from dxlrun.tooling.topics import messages
 from dxlrun_analysis.latency.conditions import Settings
 from dxlrun_analysis.latency.statistics import Block, Result, Times, figures
 
@@ -34,7 +34,7 @@ class WakeUp:
 
     scheduled_ns: int
     woken_ns: int
-    block: Annotated[int, Number("int32")]
+    block: Annotated[int, messages.Number("int32")]
 
 
 class MeasurementDetails(msgspec.Struct, frozen=True):

@@ -19,9 +19,8 @@ import numpy as np
 import yaml
 
 from dxlrun import InputError, LogError, open_log
-from dxlrun.messages import Header, JointState, JointTrajectoryPoint
 from dxlrun.tooling.logs import LogWalk
-from dxlrun.tooling.topics import ENCAPSULATION, Codec, declared_message
+from dxlrun.tooling.topics import ENCAPSULATION, Codec, declared_message, messages
 from dxlrun_analysis.playback.recorded_motion import Floats, Series, What
 
 
@@ -29,12 +28,12 @@ class JointTrajectory(msgspec.Struct):
     """Fields of the ROS 2 message trajectory_msgs/msg/JointTrajectory."""
 
     ros_type: ClassVar[str] = "trajectory_msgs/msg/JointTrajectory"
-    header: Header
+    header: messages.Header
     joint_names: tuple[str, ...]
-    points: tuple[JointTrajectoryPoint, ...]
+    points: tuple[messages.JointTrajectoryPoint, ...]
 
 
-JOINT_STATE = declared_message(JointState, "").type
+JOINT_STATE = declared_message(messages.JointState, "").type
 JOINT_TRAJECTORY = declared_message(JointTrajectory, "").type
 _TYPES: Mapping[str, tuple[What, Codec]] = {
     JOINT_STATE.name: ("states", Codec(JOINT_STATE)),
@@ -281,11 +280,11 @@ def _read_sqlite(file: Path, recording: _Recording) -> None:
 
 def _read_mcap(file: Path, recording: _Recording) -> None:
     walk = LogWalk(file)
-    for messages in walk.messages():
+    for batch in walk.messages():
         for number, channel in walk.file.channels.items():
             if channel.type_name in _TYPES and channel.encoding == "cdr":
-                rows = np.flatnonzero(messages.channel == number)
-                bodies = zip(messages.t_ns[rows].tolist(), messages.bodies(rows), strict=True)
+                rows = np.flatnonzero(batch.channel == number)
+                bodies = zip(batch.t_ns[rows].tolist(), batch.bodies(rows), strict=True)
                 kind = channel.type_name
                 recording.messages.extend(
                     _PositionMessage(channel.topic, kind, t_ns, data) for t_ns, data in bodies

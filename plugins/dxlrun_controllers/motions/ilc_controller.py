@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from dxlrun import LIVE, Angle, CommandModel, Context, Duration, Floats, Goal
-from dxlrun.messages import Header
+from dxlrun.tooling.topics import messages
 from dxlrun_controllers.joint_parameters import PerJoint, Positive, clamped, row_of
 from dxlrun_controllers.laws.learning import MOST_DELAY_S, Repetition
 from dxlrun_controllers.motions.joint_trajectory_controller import (
@@ -73,7 +73,7 @@ class IlcParameters(TrajectoryParameters):
 class LearnedRepetition:
     """Message of the topic `repetition`: tracking error of a repetition that is usable for learning."""
 
-    header: Header
+    header: messages.Header
     motion: str
     """Short name of the motion, which depends on trajectory, joints and command interface."""
     repetition: int
@@ -323,7 +323,7 @@ class IlcController(JointTrajectoryController):
         name = motion_name(self._key)
         self.context.publish(
             "repetition",
-            LearnedRepetition(Header(), name, motion.repetitions, error, best, self._largest),
+            LearnedRepetition(messages.Header(), name, motion.repetitions, error, best, self._largest),
         )
         worse = error > max(LEAST, min(self.parameters.growth * best, WORSE * motion.first))
         motion.grown = motion.grown + 1 if worse else 0

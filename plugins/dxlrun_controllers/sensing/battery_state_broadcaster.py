@@ -17,7 +17,7 @@ from dxlrun import (
     ParametersModel,
     Voltage,
 )
-from dxlrun.messages import BatteryState, Header
+from dxlrun.tooling.topics import messages
 
 PUBLISH_NS = 1_000_000_000
 """Time between two messages of the topic `battery_state`, ns."""
@@ -69,7 +69,7 @@ class BatteryStateBroadcaster(Controller[BatteryParameters]):
     """
 
     Parameters = BatteryParameters
-    Topics: ClassVar = {"battery_state": BatteryState}
+    Topics: ClassVar = {"battery_state": messages.BatteryState}
 
     @classmethod
     def interfaces(cls, parameters: BatteryParameters, joints: tuple[str, ...]) -> Interfaces:
@@ -89,7 +89,7 @@ class BatteryStateBroadcaster(Controller[BatteryParameters]):
         parameters, cells = self.parameters, self.parameters.cells or 1
         self._warn, self._stop = parameters.warn * cells, parameters.stop * cells
         self._good = self._warn + parameters.hysteresis * cells
-        self._message = BatteryState(header=Header(frame_id=parameters.frame))
+        self._message = messages.BatteryState(header=messages.Header(frame_id=parameters.frame))
 
     def on_activate(self, time_ns: int) -> None:
         """Reset the filter and all warnings, because the battery may have been replaced."""

@@ -26,7 +26,7 @@ from dxlrun import (
     Mistake,
     ParametersModel,
 )
-from dxlrun.messages import Header, Imu
+from dxlrun.tooling.topics import messages
 from dxlrun_controllers.laws.madgwick import Madgwick, Vector
 from dxlrun_controllers.sensing.sample_times import SampleTimes
 
@@ -109,7 +109,7 @@ class ImuSensorBroadcaster(Controller[ImuBroadcasterParameters]):
     """
 
     Parameters = ImuBroadcasterParameters
-    Topics: ClassVar = {"imu": Imu}
+    Topics: ClassVar = {"imu": messages.Imu}
 
     @classmethod
     def interfaces(cls, parameters: ImuBroadcasterParameters, joints: tuple[str, ...]) -> Interfaces:
@@ -137,7 +137,7 @@ class ImuSensorBroadcaster(Controller[ImuBroadcasterParameters]):
         self._east = (0.0, 0.0, math.sin(north / 2), math.cos(north / 2))
         self._bias = _ZERO
         self._resting_s = 0.0
-        self._message = Imu(header=Header(frame_id=parameters.frame))
+        self._message = messages.Imu(header=messages.Header(frame_id=parameters.frame))
         covariance, message = parameters.covariance, self._message
         _fill(message.orientation_covariance, covariance.orientation)
         _fill(message.angular_velocity_covariance, covariance.angular_velocity)

@@ -20,26 +20,19 @@ from dxlrun import (
     Mistake,
     ParametersModel,
 )
-from dxlrun.messages import (
-    BatteryState,
-    FluidPressure,
-    MagneticField,
-    Range,
-    Temperature,
-    WrenchStamped,
-)
+from dxlrun.tooling.topics import messages
 from dxlrun_controllers.sensing.sample_times import SampleTimes
 
 MessageName = Literal[
     "BatteryState", "FluidPressure", "MagneticField", "Range", "Temperature", "WrenchStamped"
 ]
 MESSAGES: Mapping[MessageName, tuple[str, type]] = {
-    "BatteryState": ("battery_state", BatteryState),
-    "FluidPressure": ("fluid_pressure", FluidPressure),
-    "MagneticField": ("magnetic_field", MagneticField),
-    "Range": ("range", Range),
-    "Temperature": ("temperature", Temperature),
-    "WrenchStamped": ("wrench", WrenchStamped),
+    "BatteryState": ("battery_state", messages.BatteryState),
+    "FluidPressure": ("fluid_pressure", messages.FluidPressure),
+    "MagneticField": ("magnetic_field", messages.MagneticField),
+    "Range": ("range", messages.Range),
+    "Temperature": ("temperature", messages.Temperature),
+    "WrenchStamped": ("wrench", messages.WrenchStamped),
 }
 """Name of each message -> its topic, as the broadcasters of ROS 2 call it, and its type."""
 Cell = Annotated[tuple[Length, ...], Field(min_length=2, max_length=2)]

@@ -16,10 +16,9 @@ from dxlrun import ProcessFault, RemoteRobot
 from dxlrun.tooling.live import SocketLink, sockets
 
 _CODE = """
-import ctypes, signal, sys
+import ctypes, runpy, signal
 ctypes.CDLL(None).prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG: it ends with the experiment
-from dxlrun.cli import main
-sys.exit(main())
+runpy.run_module("dxlrun", run_name="__main__", alter_sys=True)
 """
 _CREDENTIALS = struct.Struct("=3i")
 START_S = 60.0

@@ -422,7 +422,7 @@ class Controller(ABC, Generic[P]):
     """Kinds in `Goals` that are planned over several updates before a joint moves. Their clients are answered
     at the first `Goal.feedback` or `Goal.judge`, after 5 s at the latest."""
     Topics: ClassVar[Mapping[str, type]] = {}
-    """Message classes of the controller's own topics, by topic name: dataclasses, see dxlrun.messages.
+    """Message classes of the controller's own topics, by topic name: dataclasses, see dxlrun.tooling.topics.
 
     A topic with the name of a command has the answers to that command.
     """

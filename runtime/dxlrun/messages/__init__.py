@@ -3,11 +3,11 @@
     from dataclasses import dataclass
 
     from dxlrun import Floats
-    from dxlrun.messages import Header
+    from dxlrun.tooling.topics import messages
 
     @dataclass
     class WaveState:
-        header: Header      # its stamp is set to the time of the cycle when it is published
+        header: messages.Header      # its stamp is set to the time of the cycle when it is published
         amplitude: float
         error: Floats
 

@@ -1,11 +1,10 @@
 """Topics: the names of a log's topics, and the messages in them as bytes.
 
-Custom messages are dataclasses or msgspec structs; `dxlrun.messages` has those of ROS 2.
+Custom messages are dataclasses or msgspec structs; `messages` is a module with those of ROS 2.
 
-    from dxlrun.messages import Header
-    from dxlrun.tooling.topics import Codec, declared_message
+    from dxlrun.tooling.topics import Codec, declared_message, messages
 
-    codec = Codec(declared_message(Header, "std_msgs").type)
+    codec = Codec(declared_message(messages.Header, "std_msgs").type)
     print(codec.message.text)
 """
 
@@ -16,6 +15,7 @@ from typing import TYPE_CHECKING
 from dxlwire.faces import lazy_face
 
 if TYPE_CHECKING:
+    from dxlrun import messages as messages
     from dxlrun.channels.topic_messages import MessageSink as MessageSink
     from dxlrun.channels.topic_messages import PublishedTopic as PublishedTopic
     from dxlrun.log.reading.arrow import message_struct as message_struct
