@@ -73,9 +73,9 @@ Multiplier = Annotated[float, Field(gt=0)]
 class DiffDriveParameters(ParametersModel):
     """Keys of a diff_drive_controller in the robot file."""
 
-    left: JointNames
+    left: JointNames = Field(examples=["[left_wheel]"])
     """Wheels on the left. Their positive velocities must drive the base forward."""
-    right: JointNames
+    right: JointNames = Field(examples=["[right_wheel]"])
     """Wheels on the right. Their positive velocities must drive the base forward."""
     separation: Annotated[Length, Field(gt=0)]
     """Distance between the ground contacts of the left and the right wheels, m."""

@@ -48,7 +48,7 @@ _MOVE: Final[Mapping[JointUnit, str]] = {ROTARY: "turn", LINEAR: "slide"}
 class PayloadParameters(ParametersModel):
     """Load that the robot carries and that its URDF does not include."""
 
-    link: str
+    link: str = Field(examples=["gripper_link"])
     """Link that carries the payload."""
     mass: Annotated[Mass, Field(ge=0), LIVE]
     """Mass of the payload, kg."""

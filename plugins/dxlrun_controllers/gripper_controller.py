@@ -83,7 +83,7 @@ class GripperParameters(ParametersModel):
     """Key of the parameters -> LINEAR if it was written as a length; keys for a joint that turns are not
     in it.
     """
-    joint: str
+    joint: str = Field(examples=["gripper"])
     """Joint that opens and closes the gripper."""
     effort: Annotated[float, Field(gt=0)] | None = None
     """Effort limit of the servo, in the unit that the model measures (Nm, A or the fraction of its maximum).

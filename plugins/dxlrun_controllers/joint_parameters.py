@@ -11,7 +11,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Discriminator, Fiel
 
 from dxlrun import Context, Floats, Goal, Mistake, Outcome, ParametersModel, States, nearest_turn
 
-JointNames = Annotated[tuple[str, ...], Field(min_length=1)]
+JointNames = Annotated[tuple[str, ...], Field(min_length=1, examples=["[shoulder, elbow]"])]
 NotNegative = Annotated[float, Field(ge=0)]
 Positive = Annotated[float, Field(gt=0)]
 

@@ -36,7 +36,7 @@ from dxlrun_controllers.laws.tracking_law import CLOSING_SPEED
 class Pair(ParametersModel):
     """Follower and leader. The follower moves to scale * (leader's position) + offset."""
 
-    joint: str
+    joint: str = Field(examples=["right_elbow"])
     """Joint that follows."""
     leader: str = ""
     """Joint that leads. Either all pairs have a leader, or none has: then the joints follow the command
@@ -50,7 +50,9 @@ class Pair(ParametersModel):
 class LeaderFollowerParameters(ParametersModel):
     """Keys of a leader_follower in the robot file."""
 
-    pairs: Annotated[tuple[Pair, ...], Field(min_length=1)]
+    pairs: Annotated[tuple[Pair, ...], Field(min_length=1)] = Field(
+        examples=["[{joint: right_elbow, leader: left_elbow}]"]
+    )
     """Pairs, in the order of the values of the command `positions`."""
     command_interface: Literal["position", "posvel"] = "position"
     """`position` commands the position; `posvel` also commands the speed of the leader."""

@@ -8,7 +8,7 @@ from typing import ClassVar, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import model_validator
+from pydantic import Field, model_validator
 
 from dxlrun import (
     CommandModel,
@@ -41,7 +41,7 @@ class PidParameters(JointsParameters):
     command_interface: Literal["effort", "velocity", "pwm", "position"] = "effort"
     """Commanded interface. `position` adds the output of the law to the reference, which removes the error
     that the servo's own control leaves."""
-    gains: Gains
+    gains: Gains = Field(examples=["{p: 2.0}"])
     output_limit: PerJoint[Positive] | None = None
     """Largest magnitude of the command, in addition to the joint's own limits. With the interface `position`
     it limits the correction."""

@@ -112,7 +112,7 @@ def totals(group: EventGroup) -> EventTotals:
         ),
         ({"paused": 60}, 0, ["done: ran for 0.8 s and was paused for 1.2 s.", KEPT]),
         (
-            {"outside": (CommandOutside(0, 57.3, 90), CommandOutside(0, 1.0472, 9))},
+            {"outside": (*[CommandOutside(0, 1.0472, 9)] * 3, CommandOutside(0, 57.3, 90))},
             0,
             [
                 "ran for 2.0 s.",

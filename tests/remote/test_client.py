@@ -179,10 +179,17 @@ def test_the_choice_of_a_robot_must_be_clear():
         assert dxlrun.connect().name == "torso"
         with pytest.raises(dxlrun.DxlrunError, match="robot pair is not running; choose one of: torso"):
             dxlrun.connect("pair")
+        with pytest.raises(dxlrun.DxlrunError, match=r"torso\.yaml is a robot file; give the robot's `name`"):
+            dxlrun.connect("torso.yaml")
         with create_listener("pair")[0]:
             assert dxlrun.connect("pair").name == "pair"
             with pytest.raises(dxlrun.DxlrunError, match="several robots run: pair, torso; name one"):
                 dxlrun.connect()
+
+
+def test_motion_file_that_is_missing_is_refused_without_a_request(peer):
+    with pytest.raises(dxlrun.InputError, match=r"nosuch\.yaml:1:1: file not found; check the path"):
+        peer(None).robot.play("nosuch.yaml")
 
 
 def test_a_stop_without_an_answer_of_a_robot_that_ended_is_a_stop(peer):

@@ -400,12 +400,12 @@ class JointTrajectoryController(Controller[TrajectoryParameters]):
         if not (speeds > self._speed_limit * (1 + 1e-9)).any():
             return False
         row = int((speeds / self._speed_limit).argmax())
-        joint, limit = self.context.joints[row], self._speed_limit[row]
+        joint, unit, limit = self.context.joints[row], self.context.units[row], self._speed_limit[row]
         needed_s = math.ceil(1e3 * time_s * speeds[row] / limit - 1e-6) * 1e-3
         text = (
-            f"joint {joint} needs {speeds[row]:.4g} a second to the first point ({way[row]:.4g} in "
-            f"{time_s:.4g} s), above its limit of {limit:.4g}; set the point's time or start_in to "
-            f"{needed_s:.4g} s or more"
+            f"{joint} needs {speeds[row]:.4g} {unit.speed} to the first point ({way[row]:.4g} {unit.si} "
+            f"in {time_s:.4g} s), above its limit of {limit:.4g} {unit.speed}; set the point's time or "
+            f"start_in to {needed_s:.4g} s or more"
         )
         goal, self._goal = self._goal, None
         if goal is not None:

@@ -71,7 +71,7 @@ class Step(ParametersModel):
 
     time: Annotated[Duration, Field(ge=10_000_000)]
     """Time of the way to the pose."""
-    pose: Annotated[dict[str, Angle], NAMED_POSE]
+    pose: Annotated[dict[str, Angle], NAMED_POSE] = Field(examples=["{elbow: 30 deg}"])
     """Positions by joint, rad, the name of a pose of the robot file, or a pose of a link as in `poses`. A
     joint that is not named keeps its last goal."""
     pause: Duration = 0
@@ -89,7 +89,7 @@ class Step(ParametersModel):
 class Motion(ParametersModel):
     """Sequence of steps, and optionally the motion that follows"""
 
-    steps: Annotated[tuple[Step, ...], Field(min_length=1)]
+    steps: Annotated[tuple[Step, ...], Field(min_length=1, examples=["[{time: 1 s, pose: home}]"])]
     """Steps of the motion."""
     repeat: Annotated[int, Field(ge=1, le=10_000)] = 1
     """Number of times that the steps are played."""
@@ -110,7 +110,9 @@ class KeyframeParameters(ParametersModel):
 
     joints: JointNames
     """Joints of the controller."""
-    motions: Annotated[dict[str, Motion], Field(min_length=1)]
+    motions: Annotated[dict[str, Motion], Field(min_length=1)] = Field(
+        examples=["{nod: {steps: [{time: 1 s, pose: home}]}}"]
+    )
     """Motions by name."""
     command_interface: Literal["position", "posvel"] = "position"
     """`posvel` also commands the speed. Efforts are commanded as well if a step has torque limits."""
@@ -228,7 +230,7 @@ class KeyframeParameters(ParametersModel):
 class PlayCommand(CommandModel):
     """Goal of a keyframe_player: a motion, its speed and its repetitions."""
 
-    motion: str
+    motion: str = Field(examples=["nod"])
     speed: Annotated[float, Field(gt=0, le=10)] = 1.0
     """Divisor of all times and pauses, in addition to the motion's own speed"""
     repeat: Annotated[int, Field(ge=1, le=10_000)] | None = None

@@ -26,7 +26,7 @@ PUBLISH_NS = 1_000_000_000
 class BatteryParameters(ParametersModel):
     """Keys of a battery_state_broadcaster in the robot file."""
 
-    voltages: Annotated[tuple[str, ...], Field(min_length=1)]
+    voltages: Annotated[tuple[str, ...], Field(min_length=1, examples=["[left_hip/voltage]"])]
     """States with the voltage of the battery: `left_hip/voltage` of a servo, `power/voltage` of a device. The
     median of several states is used."""
     current: str | None = None

@@ -14,7 +14,7 @@ from dxlrun import CommandModel, Controller, Interfaces, ParametersModel
 class DeviceCommandParameters(ParametersModel):
     """Keys of a device_command_controller in the robot file."""
 
-    commands: Annotated[tuple[str, ...], Field(min_length=1)]
+    commands: Annotated[tuple[str, ...], Field(min_length=1, examples=["[board/led]"])]
     """Commands of devices, such as `board/led`."""
 
 

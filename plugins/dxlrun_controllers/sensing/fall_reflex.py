@@ -25,9 +25,9 @@ Bounds = Annotated[tuple[Angle, ...], Field(min_length=2, max_length=2)]
 class FallParameters(ParametersModel):
     """Keys of a fall_reflex in the robot file."""
 
-    imu: str
+    imu: str = Field(examples=["imu"])
     """Name of the controller, sensor or device that provides the orientation."""
-    activate: Annotated[tuple[str, ...], Field(min_length=1)]
+    activate: Annotated[tuple[str, ...], Field(min_length=1, examples=["[get_up]"])]
     """Controllers that take over. Controllers with the same claims are deactivated."""
     roll: Bounds = (-math.pi / 4, math.pi / 4)
     """Lowest and highest roll of the link, rad. Beyond these the robot falls."""

@@ -58,7 +58,7 @@ class ImuCovariance(ParametersModel):
 class ImuBroadcasterParameters(ParametersModel):
     """Keys of an imu_sensor_broadcaster in the robot file."""
 
-    sensor: str
+    sensor: str = Field(examples=["imu"])
     """Name of the sensor or device that provides angular_velocity and linear_acceleration."""
     orientation: Literal["madgwick", "sensor", "none"] = "madgwick"
     """Source of the orientation: the Madgwick filter, the sensor itself, or none."""

@@ -42,7 +42,7 @@ Cell = Annotated[tuple[Length, ...], Field(min_length=2, max_length=2)]
 class SensorParameters(ParametersModel):
     """Keys of a sensor_broadcaster in the robot file."""
 
-    message: MessageName
+    message: MessageName = Field(examples=["Range"])
     """Type of the message."""
     fields: dict[str, str | float | dict[str, float]] = Field(default_factory=dict)
     """Fields of the message. The value is a state (`sonar/range`), a number, or a weighted sum: a mapping of

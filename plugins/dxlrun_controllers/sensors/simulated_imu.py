@@ -72,6 +72,7 @@ class SimulatedImuParameters(ParametersModel):
 
     link: str = Field(
         min_length=1,
+        examples=["torso_link"],
         description="Link of the URDF that carries the unit. Its frame is the frame of the measurements.",
     )
     gyroscope: Gyroscope = Gyroscope()

@@ -45,8 +45,12 @@ def compile_poses(file: RobotFile, joints: Mapping[str, CompiledJoint], urdf: st
     mistaken = set[str]()
     for name, written in file.robot.poses.items():
         if isinstance(written, dict):
+            errors = file.errors
             _check_pose(file, name, written, joints)
-            named[name] = SolvedPose({joint: float(at) for joint, at in written.items()})
+            if file.errors != errors:
+                mistaken.add(name)
+            else:
+                named[name] = SolvedPose({joint: float(at) for joint, at in written.items()})
             continue
         try:
             named[name] = poses.solve_pose(written)

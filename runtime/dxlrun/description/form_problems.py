@@ -16,7 +16,7 @@ from dxlrun.description.base_form import Mistakes, PlugInEntry
 from dxlrun.description.document import KeyPath, Marks, PlainDocument, plain_value, text_of
 from dxlrun.description.mistakes.forms import example_at, keys_for
 from dxlrun.description.mistakes.syntax import list_text
-from dxlrun.description.mistakes.words import Remedy, UnknownKeyContext, yaml_text
+from dxlrun.description.mistakes.words import SWITCHED_OFF, Remedy, UnknownKeyContext, yaml_text
 from dxlrun.description.units import bound_text, example_of, units_of
 from dxlrun.errors import InputError, Mark, Problem, suggestion, what_and_fix
 from dxlrun.features import broken_features
@@ -521,6 +521,8 @@ def _indentation(error: _Error) -> str:
 
 def _example(error: _Error) -> str:
     key = error.path[-1] if error.path else ""
+    if error.input is False and key in SWITCHED_OFF:
+        return SWITCHED_OFF[key]
     example = error.example if isinstance(key, str) else None
     if example is None and error.model is not None and error.path[1:] and error.location[1:]:
         # An entry has no example of its own, but its section has one. The last step may be a union's member.
@@ -540,7 +542,8 @@ def _sentence_missing(error: _Error) -> tuple[str, str]:
     parent = path_text(error.path[:-1])
     if isinstance(key, int):
         return f"{parent} has too few values", "add the missing ones"
-    return f"{parent} has no {key}", f"add `{key}: {error.example or '...'}`"
+    example = error.example or _good_value(error) or "..."
+    return f"{parent} has no {key}", f"add `{key}: {example}`"
 
 
 def _sentence_unknown(error: _Error) -> tuple[str, str]:

@@ -112,6 +112,8 @@ def connect(robot: str | None = None, client: str | None = None) -> RemoteRobot:
             raise DxlrunError(f"several robots run: {names}; name one")
         robot = next(iter(found))
     if robot not in found:
+        if robot.endswith((".yaml", ".yml")):
+            raise DxlrunError(f"{robot} is a robot file; give the robot's `name` that the file has")
         raise DxlrunError(
             f"robot {robot} is not running; " + (f"choose one of: {names}" if names else "start it")
         )
@@ -371,8 +373,9 @@ class RemoteRobot:
             name, motion, player = find_live_motion(motion, self.name, self.info())
             if player:
                 return self.send(player, PLAY, {"motion": name, "speed": speed})
-        text = Path(motion).read_text(encoding="utf-8")
-        return self._execute(requests.PLAY, body=NewMotion(text, str(motion), speed))
+        from dxlrun.description.document import read_text  # PyYAML takes long to import
+
+        return self._execute(requests.PLAY, body=NewMotion(read_text(Path(motion)), str(motion), speed))
 
     def stream(self, controller: str, kind: str, lease: float = LEASE_S) -> Stream:
         """Return a stream of set-points for a controller; the newest set-point is valid for `lease` s."""

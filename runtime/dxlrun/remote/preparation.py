@@ -305,7 +305,8 @@ class Preparation:
         if model is None:
             kinds = tuple(controller.Commands)
             fields: dict[str, Field] = {"controller": plan.name, "kind": kind, "known": kinds}
-            hint = suggestion(kind, (*kinds, *joint_quantities(controller.Commands)))
+            takes = suggestion(kind, (*kinds, *joint_quantities(controller.Commands)))
+            hint = f"a cartesian_controller takes poses; {takes}" if kind == "pose" else takes
             raise refused(Code.UNKNOWN_COMMAND, fields | {"hint": hint})
         what = f"{kind} of {plan.name}"
         if units and _of_motions(kind, model):

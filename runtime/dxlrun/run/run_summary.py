@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import time
 from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -179,7 +180,7 @@ def run_verdict(run: RunSummary, plan: Plan) -> RunVerdict:
         sentences.append(f"States were invalid: {shares} of the cycles.")
     elif run.invalid and not any(run.invalid):
         sentences.append("The states of all joints were valid in every cycle.")
-    sentences += _commands_outside(run, plan)
+    sentences += islice(_commands_outside(run, plan), _MOST)
     unreached = list(find_unreached_goals(loop, events.goals, ran_ns)) if events.goals else []
     if events.goals is None and any(command.goal for command in loop.commands):
         read = f"; dxlrun analyze {run.log} reads it from the log" if run.log else ""
@@ -209,7 +210,7 @@ def last_line(group: EventGroup) -> str:
 
 def _commands_outside(run: RunSummary, plan: Plan) -> Iterator[str]:
     """Yield a sentence for each joint whose position commands were outside of its limits."""
-    for one in run.outside[:_MOST]:
+    for one in run.outside:
         joint, cycles = plan.loop.joints[one.row], counted(one.cycles, "cycle", "cycles")
         farthest, lower, upper = (f"{value:.4g}" for value in (one.farthest, joint.lower, joint.upper))
         if farthest not in (lower, upper):  # else at its limit within rounding

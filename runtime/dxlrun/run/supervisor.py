@@ -199,12 +199,16 @@ class _Run:
         """Count a signal."""
         self.signals += 1
 
-    def start_processes(self) -> Child[GuardianMessage]:
-        """Start all processes in sequence, and return the guardian; raises PortError or ProcessFault."""
+    def start_processes(self, show: Callable[[str], None]) -> Child[GuardianMessage]:
+        """Start all processes in sequence, and return the guardian; raises PortError or ProcessFault.
+
+        `show` is called with what is starting: on a busy machine each process takes seconds.
+        """
         if self.options.record:
             self.log = new_log(self.plan.recording, self.plan.robot)
         sockets: dict[str, int] = {}
         if self.plan.simulated:
+            show("simulated servos")
             self.simulation, sockets = start_simulated_buses(self.plan, self.options.ledger, self.memory)
         for planned in planned_processes(self.plan.loop):
             child = start_source(self.plan, planned, self.memory)
@@ -214,6 +218,7 @@ class _Run:
             self.recorder = start_recorder(self.log, header, self.memory, self.plan)
         self.writer = KeptStateWriter(self.memory.messages, KeptFiles(state_directory(self.plan)))
         self.writer.start()
+        show("recorder and sensors")
         for each in self.sources:
             if each.child is not None:
                 each.child.ready()
@@ -227,6 +232,7 @@ class _Run:
             epoch_offset_ns=self.offset_ns,
         )
         Heartbeat(self.memory.heartbeat).set_steering(self.steering)
+        show("guardian and loop")
         self.guardian = start_guardian(self.job, others)
         started = self.guardian.ready()
         if isinstance(started, Started):
@@ -464,7 +470,7 @@ def run_robot(plan: Plan, options: RunOptions, out: Console) -> RunSummary:
     with caught_signals(run.count_signal):
         try:
             with out.status(f"{plan.robot}: starting") as status:
-                guardian = run.start_processes()
+                guardian = run.start_processes(lambda what: status.update(f"{plan.robot}: starting {what}"))
                 run.watch_guardian(guardian, _watching(RunStatusLine(plan, status)))
         finally:
             run.end_processes()

@@ -47,6 +47,8 @@ _NEEDLESS = {
     "position": "remove it: the joint's controller sets the mode of the servo",
 }
 """Values of a joint's needless keys `type` and `mode`, each with the fix."""
+SWITCHED_OFF = {"recording": "remove it, and run with --no-record"}
+"""Fixes for sections of the file whose value is `false`."""
 
 
 class Remedy(msgspec.Struct, frozen=True):
@@ -147,6 +149,8 @@ class UnknownKeyContext(msgspec.Struct, frozen=True):
             return _NEEDLESS.get(yaml_text(value).lower(), _NEEDLESS[meaning.place[0]])
         if meaning.place[0] == "reference":
             return self._reference()
+        if value is False and meaning.place[0] in SWITCHED_OFF:
+            return SWITCHED_OFF[meaning.place[0]]
         return self._renamed(meaning, word, value)
 
     def _renamed(self, meaning: _Meaning, word: str, value: object) -> str:
