@@ -14,7 +14,6 @@ import msgspec
 from dxlrun.channels.answers import Acceptance, Answer, Code, Completion, Refusal
 from dxlrun.channels.cycle import LIMP, OFFLINE, Torque
 from dxlrun.channels.loop_requests import RebootRequest, Register, RegisterReading, TorqueRequest
-from dxlrun.control import texts
 from dxlrun.control.context import ControlContext
 from dxlrun.control.controllers.changed_registers import ChangedRegisters
 from dxlrun.control.controllers.switching import Switching
@@ -155,9 +154,9 @@ class JointRequests:
         if not lost:
             return None
         reboots = all(torque[rows[joint]] == Torque.REBOOTING for joint in lost)
-        hint = texts.WAIT_FOR_JOINT
+        hint = "try again when it answers; dxlrun probes it once a second"
         if reboots:
-            hint = texts.WAIT_FOR_REBOOT
+            hint = "it is rebooting, as requested; try again when it answers"
         return Refusal(Code.JOINT_LOST, {"joint": lost, "servo": self._labels(lost), "hint": hint})
 
     def _refuse_broken(self, rows: dict[str, int]) -> Refusal | None:
@@ -167,7 +166,7 @@ class JointRequests:
         )
         if not broken:
             return None
-        hint = texts.reboot_after_cause(broken)
+        hint = f"find the cause, then `dxlrun reboot {' '.join(broken)}` (Protocol 1.0: power off and on)"
         return Refusal(Code.HARDWARE_ERROR, {"joint": broken, "servo": self._labels(broken), "hint": hint})
 
     def _labels(self, joints: Sequence[str]) -> tuple[str, ...]:

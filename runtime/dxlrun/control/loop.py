@@ -368,7 +368,7 @@ class Overruns:
                 continue
             if isinstance(answer, str) and answer in get_args(OverrunPolicy):
                 return cast("OverrunPolicy", answer)
-            self._dismiss(hook, texts.wrong_overrun_policy(answer, get_args(OverrunPolicy)))
+            self._dismiss(hook, f"returned {answer!r}, not one of {', '.join(get_args(OverrunPolicy))}")
         return self._policy
 
     def _dismiss(self, hook: OverrunHook, why: str) -> None:

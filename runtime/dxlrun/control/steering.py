@@ -182,7 +182,7 @@ class Steering:
     def _expire_pause(self) -> None:
         """End a pause whose lease expired, by the policy `on_stale_command`."""
         self.resume_controllers()
-        what = texts.PAUSE_ENDED
+        what = "its controllers are deactivated, and the joints are held"
         if not (ends := self._stale(texts.PAUSE_EXPIRED)):
             switching = self._manager.switching
             switching.switch_controllers((), self._commanding(), why=texts.PAUSE_EXPIRED)
@@ -323,7 +323,7 @@ class Steering:
         """
         kind, data, numbers = command.kind, command.data, b""
         if kind not in FORMS:
-            problem = texts.unknown_loop_command(kind, FORMS)
+            problem = f"the loop has no command {kind}; known: {', '.join(FORMS)}"
             return Refusal(Code.INVALID, {"problem": problem}), ""
         if kind in ("load", "unload") and not self.paused:
             return Refusal(Code.NOT_IN_PAUSE), ""
@@ -333,7 +333,7 @@ class Steering:
         try:
             request = None if form is None else msgspec.json.decode(data, type=form)
         except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-            return Refusal(Code.INVALID, {"problem": texts.wrong_command_data(kind, error)}), ""
+            return Refusal(Code.INVALID, {"problem": f"wrong data for {kind}: {error}"}), ""
         words = request.name if isinstance(request, ControllerPlan) else getattr(request, "words", "")
         if isinstance(request, TorqueRequest | RebootRequest | Register | RegisterReading):
             return self.joints.execute_request(command.number, request), words

@@ -5,7 +5,7 @@ Each row has the code, the severity and the fields of one event. Refusals are in
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 from dxlrun.channels.event_records import EventCode, Severity, event_text
 from dxlrun.errors import counted
@@ -264,72 +264,17 @@ def raised(error: BaseException) -> str:
     return f"raised {type(error).__name__}: {error}"
 
 
-def wrong_overrun_policy(answer: object, known: Sequence[str]) -> str:
-    return f"returned {answer!r}, not one of {', '.join(known)}"
-
-
-def run_ended_by(controller: str, because: str) -> str:
-    return f"controller {controller} ended the run: {because}"
-
-
 # Refusals: problems and hints; their sentences are in `channels/answers.py`
 
 WRONG_MOTION_SIZES = "the motion's array does not match the sizes of its parts"
-WAIT_FOR_JOINT = "try again when it answers; dxlrun probes it once a second"
-WAIT_FOR_REBOOT = "it is rebooting, as requested; try again when it answers"
-
-
-def unknown_loop_command(kind: str, known: Iterable[str]) -> str:
-    return f"the loop has no command {kind}; known: {', '.join(known)}"
-
-
-def wrong_command_data(kind: str, error: object) -> str:
-    return f"wrong data for {kind}: {error}"
-
-
-def not_numbers(size: int) -> str:
-    return f"{size} bytes are not an array of numbers"
 
 
 def no_single_goal(controller: str) -> str:
     return f"the motion has other goals for {controller} than a single one at its start"
 
 
-def command_upper(upper: str) -> str:
-    return f"command {upper}, or deactivate it"
-
-
-def deactivate_upper(upper: str) -> str:
-    return f"deactivate {upper} in the same switch"
-
-
-def mode_of_one_joint(joint: str, others: str) -> str:
-    return f"it changes the mode of {joint}, but not of {others}; both share their servos"
-
-
-def torque_on(names: Sequence[str]) -> str:
-    return f"switch torque on with `dxlrun torque on {' '.join(names)}`"
-
-
-def move_inside_first(joints: Sequence[str], hint: str) -> str:
-    return f"move {' and '.join(joints)} inside the limits by hand, then {hint}"
-
-
-def reboot_after_cause(joints: Sequence[str]) -> str:
-    return f"find the cause, then `dxlrun reboot {' '.join(joints)}` (Protocol 1.0: power off and on)"
-
-
-def lower_not_active(controller: str) -> str:
-    return f"its lower controller {controller} is not active"
-
-
-def lower_failed(controller: str) -> str:
-    return f"its lower controller {controller} failed"
-
-
 # Consequences of commands that do not come any more
 
 PAUSE_EXPIRED = "no client ended the pause"
-PAUSE_ENDED = "its controllers are deactivated, and the joints are held"
 JOINTS_HELD = "its joints are held"
 NOTHING_ACTIVE = "no controller commands its joints; activate one by `dxlrun switch --activate NAME`"

@@ -13,7 +13,6 @@ import msgspec
 import starlette.requests
 
 from dxlrun.channels.answers import Code
-from dxlrun.remote import texts
 from dxlrun.remote.network.commander import HERE, Client
 from dxlrun.remote.preparation import invalid, refused
 from dxlrun.remote.requests.request_table import EXAMPLES, Answer, Body, Request, Role
@@ -53,7 +52,7 @@ class ClientRequest(Generic[Body]):
         except ValueError:
             value = math.nan
         if not math.isfinite(value):
-            raise invalid(texts.not_a_number(name, text))
+            raise invalid(f"{name}={str(text)[:40]} is not a number")
         return value
 
     @property
@@ -63,7 +62,7 @@ class ClientRequest(Generic[Body]):
         """
         wait = self.number("wait", 0.0)
         if not 0 <= wait <= LONGEST_WAIT_S:
-            raise invalid(texts.wait_out_of_range(wait, LONGEST_WAIT_S))
+            raise invalid(f"wait={wait:g} is out of range; write 0 to {LONGEST_WAIT_S:g} s")
         return wait
 
     @property
@@ -71,7 +70,7 @@ class ClientRequest(Generic[Body]):
         """Number of the goal in the path; raises RefusedRequest."""
         text = self.part("number")
         if not (text.isdecimal() and text.isascii() and len(text) < 16):
-            raise invalid(texts.not_a_goal_number(text))
+            raise invalid(f"{text[:40]!r} is not the number of a goal; write a whole number, such as 3")
         return int(text)
 
     @property
@@ -140,7 +139,7 @@ async def received(
     try:
         return ClientRequest(http, msgspec.json.decode(content, type=request.body))
     except (msgspec.MsgspecError, RecursionError) as error:
-        raise invalid(texts.no_body(error, EXAMPLES[request.body])) from error
+        raise invalid(f"{error}; write for example {EXAMPLES[request.body]}") from error
 
 
 async def _content(http: starlette.requests.Request, allowance: Allowance | None) -> bytes:

@@ -26,7 +26,6 @@ from msgspec.structs import asdict
 from dxlrun.channels.loop_requests import Rate, RebootRequest, Switch, TorqueRequest
 from dxlrun.compile.motion_names import PLAY, find_live_motion, is_name
 from dxlrun.errors import DxlrunError, GoalTimeout, Refused
-from dxlrun.remote import texts
 from dxlrun.remote.live.listening import MessageIterator, TopicMessage
 from dxlrun.remote.network.network_link import NetworkLink, known_robots
 from dxlrun.remote.requests import replies
@@ -585,7 +584,11 @@ def _json(content: object) -> bytes:
         body = json.dumps(content, default=_plain, allow_nan=False).encode()
     except (TypeError, ValueError, RecursionError) as error:
         where = None if isinstance(error, RecursionError) else _not_finite(content)
-        problem = texts.not_sendable(error) if where is None else texts.not_finite(*where)
+        problem = (
+            f"the request cannot be sent: {error}; use numbers, texts, lists and mappings"
+            if where is None
+            else f"{where[0]} is {where[1]}, but must be a finite number; correct it"
+        )
         raise Refused(problem, code="invalid", fields={"problem": problem}, wrong_input=True) from error
     if len(body) > MOST_BYTES:
         raise Refused(

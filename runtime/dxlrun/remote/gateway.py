@@ -49,7 +49,6 @@ from dxlrun.description.source_names import SOURCE_COMMANDS
 from dxlrun.errors import InputError
 from dxlrun.log.schemas import LogHeader
 from dxlrun.plan.loop_plan import ControllerPlan, JointValues
-from dxlrun.remote import texts
 from dxlrun.remote.asked import Allowance, ClientRequest, client_of, peer, received
 from dxlrun.remote.computation import computed
 from dxlrun.remote.goal_book import LOST
@@ -83,6 +82,7 @@ from dxlrun.remote.named.parameter_changes import PreparedChange, changed, param
 from dxlrun.remote.network.commander import Commander
 from dxlrun.remote.network.openapi import openapi
 from dxlrun.remote.preparation import (
+    BODY_TOO_DEEP,
     Preparation,
     RefusedRequest,
     invalid,
@@ -247,7 +247,7 @@ class GatewayApp:
                 return Response(status_code=400)
             # Only a deeply nested body causes this.
             except RecursionError:
-                return _refused(Refusal(Code.INVALID, {"problem": texts.BODY_TOO_DEEP}))
+                return _refused(Refusal(Code.INVALID, {"problem": BODY_TOO_DEEP}))
             # Last resort: one request fails, and the gateway serves the next one.
             except Exception as error:
                 traceback.print_exc()
@@ -350,7 +350,9 @@ class GatewayApp:
         query, rate = asked.http.query_params, asked.number("rate", requests.MOST_LOOKS)
         topics = query.getlist("topic")
         if not topics or rate <= 0:
-            raise invalid(texts.NO_TOPIC)
+            raise invalid(
+                "name a topic, and a rate above 0 Hz; write for example /stream?topic=/joint_states"
+            )
         stream = self._link.open_stream(topics, newest="newest" in query)
         frames = self._frames(stream, rate, once="once" in query)
         return StreamingResponse(frames, media_type="application/octet-stream")
@@ -425,7 +427,10 @@ class GatewayApp:
         """Play a motion file: all its controllers begin in one cycle; reply with their goals."""
         given = asked.body
         if not LEAST_SPEED <= given.speed <= MOST_SPEED:
-            raise invalid(texts.speed_out_of_range(given.speed, LEAST_SPEED, MOST_SPEED))
+            raise invalid(
+                f"a speed of {given.speed:g} is out of range; "
+                f"write a factor from {LEAST_SPEED:g} to {MOST_SPEED:g}"
+            )
         self._newest()
         file = given.file[:LONGEST_FILE]
         # One at a time, because a check may need a core and about 100 MB.
@@ -511,14 +516,18 @@ class GatewayApp:
         elif asked.part() not in self._link.controllers and kind in self._link.controllers:
             name = asked.part()[:80]
             raise refused(
-                Code.UNKNOWN_CONTROLLER, {"controller": name, "hint": texts.wrong_order(kind, name)}
+                Code.UNKNOWN_CONTROLLER,
+                {"controller": name, "hint": f"write the controller first: {kind} {name}"},
             )
         else:
             loaded = self._known(asked)
         units = query.get("units") == "true" and source is None
         seconds = asked.number("in", 0.0) if "in" in query else None
         if seconds is not None and not 0 < seconds <= LONGEST_WAY_S:
-            raise invalid(texts.duration_out_of_range(seconds, LONGEST_WAY_S))
+            raise invalid(
+                f"a duration of {seconds:g} s is out of range; "
+                f"write a time above 0 s, at most {LONGEST_WAY_S:g} s"
+            )
         if kind in INTERFACES and loaded.plan.joints and (newest := self._link.newest()) is not None:
             known = self._preparation.parse_controller(loaded.plan)
             found = joint_command(
@@ -551,7 +560,7 @@ class GatewayApp:
         shortest, usual, longest = LEASE_S
         lease = asked.number("lease", usual)
         if not shortest <= lease <= longest:
-            raise invalid(texts.lease_out_of_range(lease, shortest, longest))
+            raise invalid(f"a lease of {lease:g} s is out of range; write {shortest:g} to {longest:g} s")
         loaded, kind = self._known(asked), asked.part("kind")
         name = loaded.plan.name
         if kind in self._preparation.goals(loaded.plan):

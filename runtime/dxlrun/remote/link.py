@@ -25,7 +25,6 @@ from dxlrun.control.controllers.goal_registry import GOALS_TOPIC
 from dxlrun.messages.cdr import Codec
 from dxlrun.plan.loop_plan import ControllerPlan, ServoLimit
 from dxlrun.plan.robot_plan import Plan
-from dxlrun.remote import texts
 from dxlrun.remote.goal_book import LOST, GoalBook
 from dxlrun.remote.job import Descriptors
 from dxlrun.remote.live.live_topics import LiveTopics, TopicStream
@@ -249,7 +248,7 @@ class Link:
         number = next(self._numbers)
         command = CommandMessage(number, loaded.plan.name, kind, data, origin, lease_ns, request)
         if not self._mailbox.set_point(loaded.place, command):
-            hint = texts.SEND_AS_COMMAND
+            hint = "send the values as a command"
             raise RefusedRequest(
                 Refusal(Code.TOO_LONG, {"size": len(data), "most": LONGEST_SET_POINT, "hint": hint})
             )

@@ -52,9 +52,9 @@ from dxlrun.description.units import (
 from dxlrun.errors import suggestion, what_and_fix
 from dxlrun.plan.loop_plan import ControllerPlan, JointPlan, ServoLimit, SourcePlan
 from dxlrun.plan.robot_plan import Plan
-from dxlrun.remote import texts
 from dxlwire.joint_unit import LINEAR, ROTARY, JointUnit
 
+BODY_TOO_DEEP = "the body is nested too deeply; use fewer levels"
 LONGEST_NAME = 64
 """Upper limit of the name of a controller that a client loads, characters; the log truncates longer names."""
 BUDGET_S = 5.0
@@ -101,7 +101,7 @@ def travel_s(joint: JointPlan, distance: float, speed: float) -> float:
         return distance / speed
     if distance <= joint.goal_tolerance:
         return 0.0
-    raise invalid(texts.joint_cannot_move(joint.immovable))
+    raise invalid(f"{joint.immovable}; set the register above 0")
 
 
 def invalid(problem: str) -> RefusedRequest:
@@ -344,7 +344,9 @@ class Preparation:
             return known
         offer = self.plugins.controllers.get(plan.type)
         if offer is None:
-            raise invalid(texts.type_missing(plan.name, plan.type))
+            raise invalid(
+                f"the plug-in with the type {plan.type} of {plan.name} is missing; install it again"
+            )
         with plugin_code(plan.name, f"the parameters of {plan.name}"):
             parameters = offer.controller.Parameters.model_validate_json(plan.parameters)
         joints = tuple(self.joints[joint] for joint in plan.joints)
@@ -367,11 +369,14 @@ class Preparation:
         except ValidationError as error:
             raise invalid(mistakes(error, "the controller's entry", ControllerEntry)) from error
         if len(name) > LONGEST_NAME:
-            raise invalid(texts.name_too_long(LONGEST_NAME))
+            raise invalid(f"a name has at most {LONGEST_NAME} characters; choose a shorter one")
         if name in others:
-            raise refused(Code.NAME_TAKEN, {"controller": name, "hint": texts.OTHER_NAME})
+            raise refused(
+                Code.NAME_TAKEN,
+                {"controller": name, "hint": "choose another name, or unload that controller"},
+            )
         if entry.get("active"):
-            raise invalid(texts.active_at_once(name))
+            raise invalid(f"controllers are loaded inactive; load {name} first, then switch to it")
         if (offer := self.plugins.controllers.get(written.type)) is not None:
             parameters = self._posed(written.parameters, name, name, offer.controller.Parameters)
             written = written.model_copy(update={"parameters": parameters})
@@ -406,7 +411,9 @@ class Preparation:
                 own = [self.joints[joint] for joint in found.plan.joints]
                 require_fit(found, own, self.joints, self.urdf, self.poses.named)
             if found.registers:
-                raise invalid(texts.registers_loaded(plan.name))
+                raise invalid(
+                    f"{plan.name} changes registers, so it cannot be loaded; write it into the robot file"
+                )
         except ValidationError as error:
             raise invalid(mistakes(error, plan.name, model)) from error
         except WrongEntry as wrong:
@@ -499,9 +506,9 @@ def in_si(body: bytes, what: str, joints: Sequence[JointPlan] = ()) -> bytes:
     try:
         data = msgspec.json.decode(body)
     except RecursionError as error:
-        raise invalid(texts.BODY_TOO_DEEP) from error
+        raise invalid(BODY_TOO_DEEP) from error
     except msgspec.MsgspecError as error:
-        raise invalid(texts.not_json(what, error)) from error
+        raise invalid(f"{what} is not JSON: {error}") from error
     mistaken: dict[str, str] = {}
     plain = _plain(data, (), mistaken, _units_of(data, joints))
     if mistaken:
@@ -591,7 +598,12 @@ def unknown_controllers(
     """Return the refusal for unknown controllers; hints are similar names, or those that move the joint."""
     shown = tuple(name[:80] for name in names[:_MOST_MISTAKES])
     moving = {name: [plan.name for plan in plans if plan.command and name in plan.joints] for name in shown}
-    hints = [texts.moved_by(moving[name]) if moving[name] else suggestion(name, known) for name in shown]
+    hints = [
+        f"this is a joint; name a controller that moves it: {', '.join(moving[name])}"
+        if moving[name]
+        else suggestion(name, known)
+        for name in shown
+    ]
     if len(shown) > 1:
         hints = [f"{name}: {hint}" for name, hint in zip(shown, hints, strict=True)]
     return refused(Code.UNKNOWN_CONTROLLER, {"controller": shown, "hint": "; ".join(hints)})

@@ -208,11 +208,6 @@ class SimulatedBus:
         first = delivered % len(kept)
         return [*kept[first:], *kept[:first]] if delivered > len(kept) else kept[:delivered]
 
-    @property
-    def newest_lateness_ns(self) -> int:
-        """The last of `lateness_ns`."""
-        return int(self._line.lateness_ns[(self._line.delivered - 1) % len(self._line.lateness_ns)])
-
     # Interface for tests and faults
 
     def servo(self, servo_id: int) -> SimulatedServo:

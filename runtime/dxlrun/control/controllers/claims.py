@@ -153,10 +153,7 @@ class ControllerSnapshot(msgspec.Struct, frozen=True):
         for name in deactivate:
             upper = commander(name, [*staying.values(), *(() if name in activate else fresh)])
             if upper:
-                # Imported here because the compiler shares this module, and has no use for texts of events.
-                from dxlrun.control import texts
-
-                hint = texts.deactivate_upper(upper)
+                hint = f"deactivate {upper} in the same switch"
                 return Refusal(Code.COMMANDED, {"controller": name, "upper": upper, "hint": hint})
         for lower in (lower for name in enter for lower in known[name].into):
             if lower not in known:

@@ -217,7 +217,7 @@ class Manager:
         """
         self._goals.time_ns = self._schedule.time_ns
         if len(command.data) % 8:
-            problem = texts.not_numbers(len(command.data))
+            problem = f"{len(command.data)} bytes are not an array of numbers"
             return Refusal(Code.INVALID, {"problem": problem})
         managed = self._commandable(command.controller)
         if isinstance(managed, Refusal):
@@ -274,7 +274,7 @@ class Manager:
             return Refusal(code, {"controller": controller})
         for upper in managed.uppers:
             if upper.active:
-                hint = texts.command_upper(upper.plan.name)
+                hint = f"command {upper.plan.name}, or deactivate it"
                 return _commanded_by(controller, upper.plan.name, hint)
         return managed
 
@@ -531,7 +531,7 @@ class Manager:
             yield Refusal(Code.UNKNOWN_JOINT, {"joint": unknown})
         if (parted := plan.split_group(self._plan.joints)) is not None:
             joint, others = parted[0], " and ".join(parted[1])
-            problem = texts.mode_of_one_joint(joint, others)
+            problem = f"it changes the mode of {joint}, but not of {others}; both share their servos"
             yield Refusal(Code.CONTROLLER_FAULT, {"controller": plan.name, "problem": problem})
         if unknown := tuple(lower for lower in plan.into if lower not in known):
             yield Refusal(Code.UNKNOWN_CONTROLLER, {"controller": unknown})

@@ -119,7 +119,7 @@ class Switching:
         """
         requester, names, why = request
         if not names:
-            self.fault = self.fault or texts.run_ended_by(requester, why)
+            self.fault = self.fault or f"controller {requester} ended the run: {why}"
             return
         step = self.standing.request(names)
         if isinstance(step, SwitchStep) and not step.enter:
@@ -235,10 +235,10 @@ class Switching:
         if not limp:
             return None
         named = list(limp) if len(limp) <= MOST_NAMED else names  # too many joints: name the controllers
-        hint = texts.torque_on(named)
+        hint = f"switch torque on with `dxlrun torque on {' '.join(named)}`"
         outside = [self._joints[row].name for row in limp_rows if self._is_outside(row)]
         if outside:
-            hint = texts.move_inside_first(outside, hint)
+            hint = f"move {' and '.join(outside)} inside the limits by hand, then {hint}"
         return Refusal(Code.JOINT_LIMP, {"joint": tuple(limp), "servo": tuple(limp.values()), "hint": hint})
 
     def _is_outside(self, row: int) -> bool:
@@ -408,7 +408,7 @@ class Switching:
             active = {one.plan.name for one in lowers}
             if missing := [lower for lower in into if lower not in active]:
                 managed.on(ControllerEvent.LEAVE)
-                problem = texts.lower_not_active(missing[0])
+                problem = f"its lower controller {missing[0]} is not active"
                 event = texts.controller_not_activated(name, problem)
                 self._report_left_out(name, event, fault_of(managed, problem))
                 continue
@@ -461,7 +461,7 @@ class Switching:
         uppers = [self.named[name] for name in above(engaged, managed.plan.name)]
         self._take_out(managed, fault)
         self._drop_group(managed, str(fault))
-        why = texts.lower_failed(managed.plan.name)
+        why = f"its lower controller {managed.plan.name} failed"
         for upper in reversed(uppers):
             if upper.active:
                 self._deactivate(upper, why)

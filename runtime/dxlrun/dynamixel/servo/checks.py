@@ -46,7 +46,6 @@ from dxlwire.plan.retry import ATTEMPTS, retry
 from dxlwire.transaction import Program, Reply, TransactionOutcome
 from dxlwire.wire.protocol1 import describe_error
 
-RETURN_ALL = 2  # Status Return Level: the servo answers every instruction
 PINGS = 3  # two servos with one ID collide in most of three answers
 LISTEN_NS = 2_000_000
 """Listening time after a ping, for the answer of a second servo with the same ID, whose return delay may be

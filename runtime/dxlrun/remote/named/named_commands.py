@@ -22,7 +22,6 @@ from dxlrun.description.joints.groups import NO_GROUPS, Groups
 from dxlrun.description.source_names import SOURCE_COMMANDS
 from dxlrun.errors import suggestion
 from dxlrun.plan.loop_plan import ControllerPlan, JointPlan, SourcePlan
-from dxlrun.remote import texts
 from dxlrun.remote.preparation import (
     GROUP_FIELDS,
     ResolvedController,
@@ -95,10 +94,10 @@ def joint_command(
     if strangers and set(named) <= set(GROUP_FIELDS.values()):
         return None
     if not named:
-        raise invalid(texts.no_joint_named(plan.name, kind, plan.joints[0]))
+        raise invalid(f"{kind} of {plan.name} names no joint; write for example {plan.joints[0]}=20deg")
     if strangers:
         if strangers[0] in record.layout.joints:
-            raise invalid(texts.not_moved(plan.name, strangers[0], plan.joints))
+            raise invalid(f"{plan.name} does not move {strangers[0]}; it moves {', '.join(plan.joints)}")
         fields: dict[str, Field] = {"joint": strangers[0][:80], "controller": plan.name}
         raise refused(Code.UNKNOWN_JOINT, fields | {"hint": suggestion(strangers[0][:80], plan.joints)})
     field = GROUP_FIELDS[interface]
@@ -112,7 +111,7 @@ def joint_command(
         named_too = {"joints": [joint.name for joint in joints]} if partial else {}
         return JointCommand(chosen, msgspec.json.encode({"points": [point], "start_in": 0.0} | named_too))
     if seconds is not None:
-        raise invalid(texts.takes_no_time(plan.name))
+        raise invalid(f"{plan.name} moves its joints immediately; omit the time")
     # With a position, a velocity or an effort is an upper limit.
     still = "positions" not in fields_of
     content = {
@@ -136,7 +135,7 @@ def timed_command(known: ResolvedController, kind: str, body: bytes, seconds: fl
             return body
         if DURATION not in given:
             return msgspec.json.encode({**given, DURATION: seconds})
-    raise invalid(texts.has_own_times(known.plan.name, kind))
+    raise invalid(f"{kind} of {known.plan.name} contains its own times; omit the duration")
 
 
 def _numbers(
@@ -147,7 +146,10 @@ def _numbers(
     for joint, value in si.items():
         # An integer of JSON may exceed the range of float.
         if isinstance(value, bool) or not isinstance(value, int | float) or not -1e300 < value < 1e300:
-            raise invalid(texts.value_not_finite(known.plan.name, kind, joint, value))
+            raise invalid(
+                f"{kind} of {known.plan.name}: {joint} is {str(value)[:40]!r}, but must be a finite number; "
+                "give it in SI units, or `units=True` for texts with units"
+            )
     return {joint: float(value) for joint, value in si.items() if isinstance(value, int | float)}
 
 
@@ -171,7 +173,9 @@ def _command_for(known: ResolvedController, interface: str) -> tuple[str, tuple[
         return TRAJECTORY, None
     offered = joint_quantities(commands)
     name = known.plan.name
-    hint = texts.quantities_of_joints(name, offered) if offered else suggestion(interface, commands)
+    hint = (
+        f"{name} accepts {', '.join(offered)} for each joint" if offered else suggestion(interface, commands)
+    )
     fields_of: dict[str, Field] = {"controller": known.plan.name, "kind": interface, "known": tuple(commands)}
     raise refused(Code.UNKNOWN_COMMAND, fields_of | {"hint": hint})
 
@@ -209,7 +213,7 @@ def _present(joint: JointPlan, field: str, record: CycleRecord, *, still: bool =
     if not math.isfinite(value):
         value = otherwise
     if not math.isfinite(value):
-        raise invalid(texts.value_not_known(joint.name, field))
+        raise invalid(f"the {field} of {joint.name} are not known yet; add {joint.name} to the command")
     return value
 
 
@@ -243,12 +247,12 @@ def source_command(
     try:
         given = msgspec.json.decode(body, type=dict[str, object])
     except (msgspec.MsgspecError, RecursionError) as error:
-        raise invalid(texts.no_body(error, "led=1")) from error
+        raise invalid(f"{error}; write for example led=1") from error
     ranges = dict(zip(source.commands, source.ranges, strict=True))
     if not ranges:
-        raise invalid(texts.source_without_commands(source.label))
+        raise invalid(f"{source.label} has no commands; name items under its `commands` in the robot file")
     if not given:
-        raise invalid(texts.no_command_named(source.label, ranges))
+        raise invalid(f"the request names no command of {source.label}; name one of {', '.join(ranges)}")
     for name, value in given.items():
         if name not in ranges:
             fields: dict[str, Field] = {
@@ -259,14 +263,15 @@ def source_command(
             raise refused(Code.UNKNOWN_COMMAND, fields | {"hint": suggestion(name[:80], source.commands)})
         lowest, highest = ranges[name]
         if isinstance(value, bool) or not isinstance(value, int | float):
-            raise invalid(texts.source_value_not_a_number(source.name, name, value))
+            raise invalid(f"{source.name}/{name} = {str(value)[:40]} is not a number")
         if not lowest <= value <= highest:
-            problem = texts.outside(value, lowest, highest)
+            problem = f"{value:g} is outside {lowest:g} to {highest:g}"
             raise refused(Code.BEYOND_LIMITS, {"controller": source.name, "kind": name, "problem": problem})
     values = {f"{source.name}/{name}": value for name, value in given.items()}
     chosen = {_commander(name, controllers, active, takes) for name in values}
     if len(chosen) > 1:
-        raise invalid(texts.several_commanders(values, chosen))
+        by = ", ".join(sorted(chosen))
+        raise invalid(f"{', '.join(values)} are commanded by {by}; send one command at a time")
     return chosen.pop(), msgspec.json.encode({"values": values})
 
 
@@ -286,5 +291,11 @@ def _commander(
     if now and SOURCE_COMMANDS in takes(now[0]):
         return now[0].name
     able = [plan.name for plan in claiming if SOURCE_COMMANDS in takes(plan)]
-    commander, other = now[0].name if now else "", able[0] if able else ""
-    raise invalid(texts.not_commandable(name, commander, other))
+    by = f"{now[0].name}, and clients cannot send values for it" if now else "no controller"
+    fix = (
+        f"`dxlrun switch --activate {able[0]}{f' --deactivate {now[0].name}' if now else ''}`"
+        if able
+        else "add to `controllers` in the robot file: "
+        f"NAME: {{type: device_command_controller, commands: [{name}]}}"
+    )
+    raise invalid(f"{name} is commanded by {by}; {fix}")

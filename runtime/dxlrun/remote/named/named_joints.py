@@ -19,7 +19,6 @@ from dxlrun.errors import suggestion
 from dxlrun.features import stages
 from dxlrun.plan.loop_plan import ControllerPlan
 from dxlrun.plan.robot_plan import Plan
-from dxlrun.remote import texts
 from dxlrun.remote.live.states import RobotStates
 from dxlrun.remote.preparation import refused
 from dxlrun.remote.requests.replies import JointServo
@@ -139,7 +138,11 @@ def named_joints(plan: Plan, controllers: Iterable[ControllerPlan], names: Seque
     unknown = tuple(name[:_LONGEST] for name in names if name not in joints and name not in groups)
     unknown = unknown[:_MOST_NAMES]
     if unknown or not names:
-        hint = suggestion(unknown[0], (*joints, *groups)) if unknown else texts.NAME_JOINTS
+        hint = (
+            suggestion(unknown[0], (*joints, *groups))
+            if unknown
+            else "name joints, groups, controllers, or all"
+        )
         raise refused(Code.UNKNOWN_JOINT, {"joint": unknown or "without a name", "hint": hint})
     return tuple(
         dict.fromkeys(joint for name in names for joint in ((name,) if name in joints else groups[name]))
@@ -157,7 +160,9 @@ def require_reboots(plan: Plan, joints: tuple[str, ...]) -> None:
         if "reboot" not in find_table(servo.model, bus.protocol).capabilities
     ]
     if cannot:
-        raise refused(Code.NOT_REBOOTED, {"joint": joints, "problem": texts.no_reboot(cannot)})
+        names, verb = ", ".join(cannot), "has" if len(cannot) == 1 else "have"
+        problem = f"{names} {verb} no reboot instruction; switch the torque or the power off and on"
+        raise refused(Code.NOT_REBOOTED, {"joint": joints, "problem": problem})
 
 
 # Registers
@@ -181,7 +186,7 @@ def prepared_register(plan: Plan, name: str, item: str, value: int | str) -> Reg
         raise refused(code, fields | {"problem": str(error)}) from error
     # The value is not a quantity.
     except ValueError as error:
-        problem = texts.wrong_value(name, item, error)
+        problem = f"{item} of {name}: {error}"
         raise refused(Code.WRONG_QUANTITY, fields | {"problem": problem}) from error
     return Register(name, item, register.value, _row(plan, name, servo))
 
@@ -192,8 +197,10 @@ def prepared_reading(plan: Plan, name: str, item: str) -> RegisterReading:
     """
     servo, table, fields = _servo(plan, name, item)
     if item not in table.items:
-        hint = suggestion(item[:_LONGEST], table.items, texts.register_list(table.model))
-        problem = texts.no_register(table.model, item[:_LONGEST])
+        hint = suggestion(
+            item[:_LONGEST], table.items, f"list the registers by `dxlrun models {table.model}`"
+        )
+        problem = f"an {table.model} has no register {item[:_LONGEST]}"
         raise refused(Code.UNKNOWN_REGISTER, fields | {"problem": problem, "hint": hint})
     return RegisterReading(name, item, _row(plan, name, servo))
 
@@ -231,7 +238,7 @@ def _servo(plan: Plan, name: str, item: str) -> tuple[ServoPlan, ControlTable, d
     mine = [known[name]] if name in known else [*joints.get(name, ())]
     if not mine:
         hint = (
-            texts.not_a_servo(name)
+            f"{name} is not a servo; print its states by `dxlrun get {name}`"
             if name in plan.loop.source_states
             else suggestion(name[:_LONGEST], tuple(known))
         )
@@ -239,6 +246,7 @@ def _servo(plan: Plan, name: str, item: str) -> tuple[ServoPlan, ControlTable, d
     bus, servo = mine[0]
     models = dict.fromkeys(each.model for _, each in mine)
     if len(models) > 1:
-        problem = texts.several_models(name, models, [each.own_name for _, each in mine])
+        names = ", ".join(each.own_name for _, each in mine)
+        problem = f"{name} has servos of several models ({', '.join(models)}); name one of them: {names}"
         raise refused(Code.INVALID, {"problem": problem})
     return servo, find_table(servo.model, bus.protocol), fields

@@ -16,7 +16,6 @@ from dxlrun.control.controllers.live_parameters import live_names, value_of
 from dxlrun.description.base_form import ParametersModel
 from dxlrun.errors import suggestion
 from dxlrun.plan.loop_plan import ControllerPlan
-from dxlrun.remote import texts
 from dxlrun.remote.preparation import invalid, mistakes, plugin_code, refused
 from dxlrun.remote.requests.replies import NewValue, Parameter, Written
 
@@ -61,7 +60,7 @@ def changed(plan: ControllerPlan, now: ParametersModel, values: Mapping[str, Wri
     Raises RefusedRequest for an unknown or fixed parameter, or an invalid value.
     """
     if not values:
-        raise invalid(texts.NO_PARAMETER)
+        raise invalid('nothing to change; write for example {"values": {"speed": "20 deg/s"}}')
     known = {parameter.name: parameter for parameter in parameters_of(now)}
     for name in values:
         _require_live(plan.name, name[:80], known)
@@ -94,11 +93,12 @@ def _require_live(controller: str, name: str, known: Mapping[str, Parameter]) ->
     fields: dict[str, Field] = {"controller": controller, "parameter": name}
     if name not in known:
         inner = [one for one in known if one.startswith(f"{name}.")]
-        hint = texts.parameter_parts(inner) if inner else suggestion(name, tuple(known))
+        hint = f"name one of its values: {', '.join(inner)}" if inner else suggestion(name, tuple(known))
         raise refused(Code.UNKNOWN_PARAMETER, fields | {"hint": hint})
     if not known[name].live:
-        live = [one.name for one in known.values() if one.live]
-        raise refused(Code.NOT_LIVE, fields | {"known": texts.live_parameters(live)})
+        live = ", ".join(one.name for one in known.values() if one.live)
+        said = f"live are {live}" if live else "it has no live parameters"
+        raise refused(Code.NOT_LIVE, fields | {"known": said})
 
 
 def _put(written: dict[str, object], path: list[str], value: Written, now: object) -> None:
@@ -118,5 +118,5 @@ def _put(written: dict[str, object], path: list[str], value: Written, now: objec
 def _number(name: str, value: object) -> bool | int | float:
     # A plug-in can mark a parameter of any type as live.
     if not isinstance(value, bool | int | float):
-        raise invalid(texts.parameter_not_a_number(name, value))
+        raise invalid(f"{name} = {value!r} cannot change in a run; only numbers and bools can")
     return value
