@@ -278,10 +278,6 @@ class ServoPlan(msgspec.Struct, frozen=True):
             f"{help_link('a-joint-is-outside-its-limits')}"
         )
 
-    def step_text(self, step: float) -> str:
-        """Format a change of the joint's position, rad or m, for a message: `12 deg`, `5 mm`."""
-        return self.unit.text(step, digits=0)
-
     def mode_plan(self, mode: int) -> ModePlan:
         """Return the plan of a mode of this servo.
 

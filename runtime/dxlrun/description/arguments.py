@@ -152,5 +152,5 @@ def _unusable(what: str, fix: str) -> FilledScalar:
 
 def _suggestion(name: str, known: Sequence[str]) -> str:
     if not known:
-        return "remove it, or declare it: `arguments: {NAME: {default: ..., help: ...}}`"
+        return f"remove it, or declare it: `arguments: {{{name}: {{default: ..., help: ...}}}}`"
     return suggestion(name, known, f"known arguments: {', '.join(known)}")

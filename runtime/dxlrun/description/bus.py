@@ -45,6 +45,8 @@ _LEAST_LATENCY_NS: Mapping[str, int] = MappingProxyType({"ftdi": 1_000_000, "dir
 def _port(value: str) -> str:
     if sys.platform == "linux" and re.fullmatch(r"COM\d+", value):
         raise validation_error(f"{value} is a port of Windows", "write for example /dev/ttyUSB0, or sim")
+    if value.lower() in ("simulated", "simulation", "simulator", "mock", "fake"):
+        raise validation_error(f"{value} is not a port", "write sim for simulated servos")
     return value
 
 

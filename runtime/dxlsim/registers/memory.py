@@ -226,10 +226,6 @@ class Memory:
             self._cells_at[address, length] = cells
         return cells
 
-    def reaches_eeprom(self, address: int, data: bytes) -> bool:
-        """Return True if a write would change the EEPROM area, directly or through Indirect Data."""
-        return any(run.cells.eeprom for run in self.runs(address, data))
-
     def _run(self, address: int, data: bytes, cells: Cells) -> Run:
         items = cells.items
         start, all_of_them = address, data

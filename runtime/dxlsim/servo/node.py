@@ -231,7 +231,9 @@ class SimulatedNode(ABC):
 
     def _beyond_shadow(self, servo_id: int, address: int, data: bytes) -> int:
         """Return the error for a write to the EEPROM through the Secondary ID, 0 for any other write."""
-        shadow = servo_id == self.secondary_id and self.registers.reaches_eeprom(address, data)
+        shadow = servo_id == self.secondary_id and any(
+            run.cells.eeprom for run in self.registers.runs(address, data)
+        )
         return servo_protocol2.StatusErrorNumber.ACCESS if shadow else 0
 
     def _write_listed(self, writes: ListedWrites | None) -> int:

@@ -191,7 +191,7 @@ class Jumps:
         if now_ns - self._reported_ns[index] >= REPORT_AGAIN_NS:
             self._reported_ns[index] = now_ns
             servo = self._servos[index]
-            text = reports.jumped(servo.joint, servo.step_text(abs(step)), elapsed_ns)
+            text = reports.jumped(servo.joint, servo.unit.text(abs(step), digits=0), elapsed_ns)
             self._reports.report(Reason.IMPLAUSIBLE, servo.joint, text)
         return False
 

@@ -146,7 +146,7 @@ def compile_servos(file: RobotFile, models: Mapping[str, str], motors: Motors) -
             for setting in stage.compile(found, servo, table)
         }
         declared = {name: setting.value for name, setting in settings.items()}
-        motor = compile_motor(found, servo, table, declared, motors.of_servo(servo.name))
+        motor = compile_motor(found, servo, table, declared, motors.servos.get(servo.name))
         made = CompiledServo(servo, table, tuple(settings.values()), motor, known_bus, certain)
         compiled[servo.name] = made
     return compiled

@@ -28,10 +28,6 @@ class Motors(msgspec.Struct, frozen=True):
     servos: Mapping[str, MotorDescription] = {}  # by the servo that the file describes
     simulations: Mapping[str, MotorDescription] = {}  # by the servo that is simulated with another motor
 
-    def of_servo(self, name: str) -> MotorDescription | None:
-        """Return the motor file that describes a servo, by the servo's name; None if it has none."""
-        return self.servos.get(name)
-
     def simulated(self, name: str) -> MotorDescription | None:
         """Return the motor file for simulating a servo: that of `simulation.motor`, else its own file."""
         return self.simulations.get(name) or self.servos.get(name)
