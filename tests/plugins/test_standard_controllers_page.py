@@ -6,10 +6,12 @@ from pathlib import Path
 
 import pytest
 import yaml
+from pydantic import ValidationError
 from tests.kit.pages import page_text
 
 from dxlrun.cli.examples import schema_text
 from dxlrun.control.controllers.plugin_loading import load_plugins
+from dxlrun.description.form_problems import data_problems
 
 ROOT = Path(__file__).parents[2]
 PAGE = page_text("standard-controllers.md")
@@ -38,6 +40,16 @@ def test_snippets_are_accepted(name):
         for entry in yaml.safe_load(block).values():
             kind = OFFERS[entry["type"]].controller
             kind.Parameters.model_validate({key: entry[key] for key in entry if key not in RUNTIME_KEYS})
+
+
+@pytest.mark.parametrize("name", [name for name in OFFERS if name != "cartesian_controller"])
+def test_missing_key_comes_with_an_example(name):
+    model = OFFERS[name].controller.Parameters
+    try:
+        model.model_validate({})
+    except ValidationError as error:
+        missing = [problem.fix for problem in data_problems(error, name, model, 20)]
+        assert [fix for fix in missing if "..." in fix] == []
 
 
 def test_every_robot_is_in_the_table_of_examples():
