@@ -225,7 +225,9 @@ def _bodies(plan: Plan) -> UrdfBodies | None:
 
 def _mechanisms(plan: Plan) -> tuple[Mechanism, ...]:
     """Return which simulated servos move which joints; mechanisms with a single servo come first."""
-    by_row = {servo.row: (index, servo) for index, servo in enumerate(_simulated_servos(plan))}
+    # The simulator adds the servos in this order.
+    simulated = (servo for bus in plan.buses if bus.port == SIMULATED for servo in bus.servos)
+    by_row = {servo.row: (index, servo) for index, servo in enumerate(simulated)}
     found: list[Mechanism] = []
     for one in plan.mechanics.mechanisms(len(plan.loop.joints)):
         servos = [by_row[row] for row in one.servos if row in by_row]
@@ -248,11 +250,6 @@ def _mechanism(
 ) -> Mechanism:
     parts = (MechanismServo(index, one.encoder_reference, one.direction * one.ratio) for index, one in servos)
     return Mechanism(tuple(parts), joints, matrix, loads, TYPES[servos[0][1].unit])
-
-
-def _simulated_servos(plan: Plan) -> list[ServoPlan]:
-    """Return the servos on simulated buses, in the order in which the simulator adds them."""
-    return [servo for bus in plan.buses if bus.port == SIMULATED for servo in bus.servos]
 
 
 def _simulated_bus(plan: Plan, bus: BusPlan) -> BusConfig:

@@ -142,7 +142,8 @@ class Writing(WrittenRows):
         super().__init__(session, servos, items)
         self._session = session
         self._recording = session.log.recording
-        samples = Samples([session.plan], _Joints(), ServoRows(np.empty(0), *_empty()), _NoReports())
+        rows = ServoRows(np.empty(0), np.empty(0, np.bool_), np.empty(0, np.int64))
+        samples = Samples([session.plan], _Joints(), rows, _NoReports())
         self._writes = _Writes(_sync_writes(session, servos, items, raw))
         self._kernel = _kernel(session, session.plan, samples, self._writes, self._goals)
         self._kernel.plan_writes()
@@ -157,10 +158,6 @@ class Writing(WrittenRows):
             session.check_open()
         if self._recording is not None:
             self._recording.commit_packets()
-
-
-def _empty() -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
-    return np.empty(0, np.bool_), np.empty(0, np.int64)
 
 
 def _kernel(

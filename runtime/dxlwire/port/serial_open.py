@@ -224,7 +224,8 @@ def _holder(path: str, describe: DescribeProcess) -> str:
     The first non-empty description is used. Without one, each process is named by its command. Processes
     of other users may be invisible."""
     device = os.path.realpath(path)
-    found = [process for process in _processes() if _has_open(process, device)]
+    processes = sorted(Path("/proc").glob("[0-9]*"))  # none on systems other than Linux
+    found = [process for process in processes if _has_open(process, device)]
     own = str(os.getpid())
     if [process.name for process in found] == [own]:
         return "this program itself; close the other one first"
@@ -234,10 +235,6 @@ def _holder(path: str, describe: DescribeProcess) -> str:
     named = [f"{_command(process)} (process {process.name})" for process in found]
     them = "them" if len(named) > 1 else "it"
     return f"{' and '.join(named) or 'a process of another user'}; stop {them} first"
-
-
-def _processes() -> Iterable[Path]:
-    return sorted(Path("/proc").glob("[0-9]*"))  # none on systems other than Linux
 
 
 def _has_open(process: Path, device: str) -> bool:

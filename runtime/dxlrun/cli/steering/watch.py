@@ -255,7 +255,8 @@ def controllers(watched: WatchedRobot) -> Table:
 def event_lines(watched: WatchedRobot, most: int) -> list[Sentence]:
     """Return lines for the last `most` events, the newest one last, with their age."""
     lines = []
-    shown = [event for event in watched.events if not _belongs_to_start(event)]
+    # Of the loop's commands, the run itself gives only the pause in which it waits for its gateway.
+    shown = [event for event in watched.events if event["origin"] != OWN_ORIGIN]
     for event in shown[-most:] if most > 0 else []:
         severity = event["severity"]
         tone: Tone = "error" if severity >= 40 else "warning" if severity >= 30 else "plain"
@@ -263,14 +264,6 @@ def event_lines(watched: WatchedRobot, most: int) -> list[Sentence]:
         ago = watched.states.time_ns * 1e-9 - event["time"]
         lines.append(Sentence(f"{ago:5.1f} s ago, {event['source']}: {text}", tone))
     return lines
-
-
-def _belongs_to_start(event: Row) -> bool:
-    """Return whether an event reports the pause in which a run waits for its gateway, at every start.
-
-    The run itself has no other commands for the loop.
-    """
-    return bool(event["origin"] == OWN_ORIGIN)
 
 
 def snapshot(watched: WatchedRobot) -> tuple[Table | Sentence, ...]:

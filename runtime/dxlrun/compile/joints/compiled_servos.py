@@ -138,7 +138,8 @@ def compile_servos(file: RobotFile, models: Mapping[str, str], motors: Motors) -
             _check_reference(file, servo, table)
         # The registers of a servo whose model is not read yet are unknown. Those that fit the assumed model
         # are kept, because a simulated servo has exactly these; mistakes are not errors yet.
-        certain = (servo.model != AUTO or servo.name in models) and (known_bus or _one_table(model))
+        of_one_protocol = len(protocols_of(model)) == 1  # an MX name stands for two firmwares
+        certain = (servo.model != AUTO or servo.name in models) and (known_bus or of_one_protocol)
         found = file if certain else RobotFile(file.description)
         settings = {
             setting.name: setting
@@ -239,11 +240,6 @@ def _table(
             fix,
         )
     return find_table(model, protocols[0])
-
-
-def _one_table(model: str) -> bool:
-    """Return True if a model speaks one protocol only; an MX name stands for two firmwares."""
-    return len(protocols_of(model)) == 1
 
 
 def _check_reference(file: RobotFile, servo: DescribedServo, table: ControlTable) -> None:

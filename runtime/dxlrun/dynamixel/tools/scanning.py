@@ -13,7 +13,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 
 import msgspec
-from msgspec import structs
 from msgspec.structs import replace
 
 from dxlrun.dynamixel.remedies import CHECK, choose_remedy
@@ -23,7 +22,7 @@ from dxlwire.control_table import ControlItem, ControlTable, all_tables, models_
 from dxlwire.control_table.device_models import devices_by_number
 from dxlwire.plan.line import MOST_SPARE, Line, listen_transaction
 from dxlwire.plan.retry import ATTEMPTS, extend_timeouts, retry
-from dxlwire.transaction import BROADCAST_ID, Program, Reply, Transaction, TransactionOutcome
+from dxlwire.transaction import BROADCAST_ID, Program, Reply, TransactionOutcome
 from dxlwire.wire.dialect import dialect_of
 
 LATE_NS = 20_000_000  # listening time after the last request at a rate, for replies that the adapter delays
@@ -163,7 +162,7 @@ def _search(
         slot_ns = line.wire_ns(line.dialect.OVERHEAD + line.dialect.PING_LENGTH) + SLOT_NS
         ping = line.unanswered(line.dialect.ping(BROADCAST_ID))
         slots_ns = slot_ns * (len(ids) + 1) + line.latency_ns
-        refuse_echo(tool.port.name, (yield structs.replace(ping, due_ns=ping.due_ns + slots_ns)))
+        refuse_echo(tool.port.name, (yield replace(ping, due_ns=ping.due_ns + slots_ns)))
         there = heard.ids & set(ids)
         # Boards with the maker's Slave class, which do not answer a broadcast ping, may share the line.
         if there:
@@ -194,7 +193,9 @@ def _one_by_one(
     suspected: list[int] = []
     for index, servo_id in enumerate(ids):
         ping = line.ping(servo_id)
-        reply = yield ping if timeout_ns is None else _hurried(tool, ping, timeout_ns)
+        if timeout_ns is not None:
+            ping = replace(ping, timeout_ns=ping.due_ns + tool.port.latency_ns + timeout_ns)
+        reply = yield ping
         refuse_echo(tool.port.name, reply)
         if reply.answered:
             there.add(servo_id)
@@ -223,10 +224,6 @@ def _answering(line: Line, suspected: Sequence[int]) -> Program[set[int]]:
         if reply.outcome is not TransactionOutcome.TIMEOUT:
             there.add(servo_id)
     return there
-
-
-def _hurried(tool: ToolLine, transaction: Transaction, timeout_ns: int) -> Transaction:
-    return structs.replace(transaction, timeout_ns=transaction.due_ns + tool.port.latency_ns + timeout_ns)
 
 
 def read_servo(line: Line, servo_id: int, port: str) -> Program[FoundServo]:
