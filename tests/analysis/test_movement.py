@@ -236,6 +236,9 @@ CAPABLE = {
     "carries a load all the time": Joint(position=behind(SWING) - 0.12),
     "has a low gain, as its file says": Joint(position=behind(SWING, 6, 0.5), planned={"softness": 3.0}),
     "rests": Joint(way=ZERO, position=ZERO),
+    "is within its tolerance": Joint(
+        ZERO - 0.2, ZERO - 0.6, planned={"logged": JointPlan("j0", -9.0, 9.0, None, tolerance=0.45)}
+    ),
     "is lifted, and gives way where it was not before": Joint(LIFT, LIFT * 0.85, LIFT),
     "carries more later, and gives way by as much": Joint(
         AGAIN, AGAIN - 0.02 - 0.13 * MORE, 0.08 + 0.52 * MORE

@@ -321,6 +321,21 @@ def test_a_goal_whose_commands_are_withdrawn_neither_speeds_up_nor_turns_back(dt
     assert moving > 100
 
 
+def test_a_goal_that_was_put_where_its_joint_is_begins_from_rest():
+    rig = rig_of(**FAR)
+    for number in range(60):
+        rig.apply(position=0.02 * number)
+    rig.states.position[:] = rig.goals.position
+    rig.gate.anchor(np.array([True]))
+    assert rig.apply(position=8.0).moved == pytest.approx(0.1)
+    rig = rig_of(**FAR)
+    for torque, command in ((Torque.OFF, 0.001), (Torque.ON, 0.002)):
+        rig.states.torque[:] = torque
+        sent = rig.apply(position=command)
+    assert sent.position == pytest.approx(0.001), "what was commanded of the limp joint is no speed"
+    assert rig_of(Mode.VELOCITY, eased=False).apply(velocity=0.05).velocity == 0.05
+
+
 def test_a_speed_toward_the_position_holds_for_the_goal_too():
     rig = rig_of()
     sent = [rig.apply(position=1.0, velocity=0.5) for _ in range(100)]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dxlrun.control.safe_motion import ARRIVED, MODES_NS, SETTLE_NS, STAND_NS
-from dxlrun.control.steering import PAUSED_CYCLE_NS
+from dxlrun.control.steering import PAUSE_LEASE_NS, PAUSED_CYCLE_NS
 from dxlrun.plan.policy_plan import HOLD, LIMP, SLOW_SPEED, Policy, PolicyPlan, PolicyStepPlan
 from dxlwire.joint_unit import ROTARY
 from dxlwire.modes import Mode
@@ -128,9 +128,18 @@ def test_less_torque_lasts_its_time_at_each_of_its_steps(robot):
     assert record.woken_ns - limits[0][0] == 300_000_000
 
 
-def test_a_run_that_ends_in_a_pause_leaves_the_guardian_its_usual_patience(robot):
+@pytest.mark.parametrize("ends_ns", [3 * PERIOD_NS, PAUSE_LEASE_NS + 10 * PERIOD_NS])
+def test_a_pause_that_ends_with_the_run_or_its_lease_leaves_the_guardian_its_usual_patience(robot, ends_ns):
     robot.build(policies=PolicyPlan(on_exit=POSE))
     robot.ask("pause")
-    robot.hardware.idle = lambda *_: robot.stop.request() if len(robot.sink.cycles) == 3 else None
+    seen, begun_ns = [], robot.clock.now_ns()
+
+    def stop(*_):
+        if robot.record.woken_ns - begun_ns >= ends_ns:
+            seen[:] = robot.patience
+            robot.stop.request()
+
+    robot.hardware.idle = stop
     robot.loop.run()
     assert robot.patience == [PAUSED_CYCLE_NS, PERIOD_NS]
+    assert seen == robot.patience or ends_ns < PAUSE_LEASE_NS

@@ -2,6 +2,7 @@
 
 import math
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -65,6 +66,17 @@ def pid(p: float, goal: float, **rest: float) -> ServoCommand:
 )
 def test_a_motor_turns_with_the_speed_of_duty_and_torque(seconds, command, load, velocity):
     assert after(seconds, command, load)[1] == pytest.approx(velocity, rel=0.02 if load.inertia else 1e-6)
+
+
+def test_viscous_friction_slows_a_motor_in_its_time_constant():
+    motor = msgspec.structs.replace(MOTOR, viscous_friction=1.0)
+    mechanics = Mechanics(0)
+    mechanics.add_servo(motor, NO_LOAD, 0.0)
+    mechanics.command_servo(0, FULL)
+    mechanics.step_to(2 * STEP_NS)
+    assert state(mechanics)[1] == pytest.approx(1.5 * (1 - math.exp(-2 * DT / (0.003 / (4 / 3)))), rel=0.03)
+    mechanics.step_to(S)
+    assert state(mechanics)[1] == pytest.approx(1.5)
 
 
 def test_less_voltage_is_less_speed_and_less_torque():
@@ -213,6 +225,18 @@ def test_geared_load_turns_with_a_shaft_that_is_put_within_half_a_turn(by):
         mechanics.step_to(50_000_000)
         speeds.append(mechanics.plant.velocity.item(0))
     assert speeds[1] == speeds[0] != 0.0
+
+
+def test_geared_load_whose_turns_were_recounted_hangs_as_before_when_a_servo_is_added():
+    speeds = []
+    for turns in (0, 1):
+        mechanics = one(LIMP, Load(gravity=1.0, gravity_angle=0.5, turns=0.5), 2.0)
+        mechanics.recount_turns(0, 2.0 + turns * math.tau)
+        mechanics.add_servo(MOTOR, NO_LOAD, 0.0)
+        mechanics.step_to(50_000_000)
+        speeds.append(mechanics.plant.velocity.item(0))
+    assert speeds[1] == pytest.approx(speeds[0])
+    assert speeds[0] != 0.0
 
 
 # Heat and overload

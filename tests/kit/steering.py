@@ -312,7 +312,7 @@ class Story(VirtualRun):
     def waits(self) -> object:
         number, found = self.next_answer(None)
         self.later.append(number)
-        return None if found is None or isinstance(found, Acceptance) else found
+        return None if isinstance(found, Acceptance) else found or "no answer"
 
     def active(self, text: str) -> object:
         wanted = [[] if one == "none" else one.split() for one in text.split(", then ")]

@@ -65,6 +65,13 @@ def test_a_later_writer_goes_on_where_one_was_killed_in_the_middle(ends):
     later = SlotWriter(slot_memory(writer))
     later.write_sample(3, np.full(VALUES, 3.0))
     assert (reader.read_sample(), reader.sample.tolist()) == (3, [3.0] * VALUES)
+    for number in (4, 5, 6):
+        later.write_sample(number, np.zeros(VALUES))
+    count = slot_memory(writer)[:8].cast("Q")
+    count[0], newest = count[0] - 2, count[0]  # as a reader has it that two samples overtake in its copy
+    assert reader.read_sample() is None
+    count[0] = newest
+    assert (reader.read_sample(), reader.read_sample()) == (6, None)
 
 
 def slot_memory(writer: SlotWriter) -> memoryview:

@@ -184,6 +184,7 @@ def run(path: Path, log: Path, positions: tuple[float, float], seconds: float = 
 def test_rate_and_timeout_have_defaults_by_the_loop_and_by_the_rate(crane, entry, period_ms, timeout_ms):
     (plan,) = decode_sensors(plan_of(crane(("link: tip}", f"link: tip{entry}}}"))).feature_plans["sensors"])
     assert (plan.period_ns, plan.timeout_ns) == (period_ms * 1_000_000, timeout_ms * 1_000_000)
+    assert plan.noisy == ()
 
 
 @pytest.mark.parametrize("physics", ["independent", "mujoco"])
