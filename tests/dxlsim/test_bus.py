@@ -259,17 +259,20 @@ def test_the_latency_timer_keeps_each_short_reply_back(timer_ms):
     assert [entry.t_ns for entry in bus.ledger.entries[:2]] == [0, PONG_ENDS]
 
 
-def test_a_full_packet_does_not_wait_for_the_timer():
-    bus = new_bus(AdapterConfig(latency_timer_ns=16 * MS))
-    noise = bytes(range(100))
-    bus.inject_noise(noise, 0)
-    assert handed_over(bus) == [(62 * BYTE, noise[:62]), (62 * BYTE + 16 * MS, noise[62:])]
-
-
-def test_the_timer_may_run_out_in_the_middle_of_a_reply():
-    bus = new_bus(AdapterConfig(latency_timer_ns=MS))
-    bus.inject_noise(bytes(range(20)), MS - 5 * BYTE)
-    assert handed_over(bus) == [(MS, bytes(range(5))), (2 * MS, bytes(range(5, 20)))]
+@pytest.mark.parametrize(
+    ("timer_ms", "size", "at_ns", "handed"),
+    [
+        (16, 100, 0, [(62 * BYTE, 62), (62 * BYTE + 16 * MS, 38)]),  # a full packet does not wait
+        (1, 20, MS - 5 * BYTE, [(MS, 5), (2 * MS, 15)]),  # the timer may run out within a reply
+        (1, 20, 2 * MS + 50 * BYTE, [(3 * MS, 20)]),  # it runs out with an empty buffer, too
+    ],
+)
+def test_a_packet_is_handed_over_when_it_is_full_or_the_timer_runs_out(timer_ms, size, at_ns, handed):
+    bus = new_bus(AdapterConfig(latency_timer_ns=timer_ms * MS))
+    bus.inject_noise(bytes(range(size)), at_ns)
+    found = handed_over(bus)
+    assert [(due_ns, len(data)) for due_ns, data in found] == handed
+    assert b"".join(data for _, data in found) == bytes(range(size))
 
 
 def test_bytes_one_by_one_come_as_they_pass_the_wire_or_with_the_timer():

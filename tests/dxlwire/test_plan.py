@@ -239,6 +239,9 @@ def test_import_loads_neither_numpy_nor_dxlrun() -> None:
     code = """
 import sys, dxlwire
 assert not {"numpy", "msgspec"} & set(sys.modules)
+from dxlwire.control_table import all_tables
+assert len(all_tables()) > 60
+assert not {"numpy", "pydantic", "yaml", "serial", "dynamixel_sdk"} & set(sys.modules)
 for name in dxlwire.__all__:
     getattr(dxlwire, name)
 import dxlwire.exchange.kernel, dxlwire.exchange.idle, dxlwire.plan.planning, dxlwire.port.reopening
