@@ -109,6 +109,7 @@ def listed_samples(
                 f"{samples[-1].t_ns / 1e9:g} s",
                 "sort the points by time",
             )
+            continue
         targets = {
             joint: SampledTarget(
                 plain(target.position),

@@ -366,6 +366,7 @@ _NUMBER = "a number"
 _WITH_UNIT = "a number with a unit"
 _WHOLE = "a whole number"
 _BOOL = "true or false"
+_SWITCHES: Mapping[str, str] = {"yes": "true", "on": "true", "no": "false", "off": "false"}
 _TEXT = "text"
 _TYPES: Mapping[str, str] = {
     "int_type": _WHOLE,
@@ -427,8 +428,8 @@ def _bound(value: object, error: _Error) -> str:
 def _remedy(error: _Error, marks: Marks) -> str:
     """Return the fix for a value of the wrong type or outside its range."""
     expected = _TYPES.get(error.kind, "")
-    if expected == "a list" and isinstance(error.input, str) and (items := _items(error.input, error, marks)):
-        return f"write `{error.path[-1] if error.path else 'LIST'}: {items}`"
+    if isinstance(error.input, str) and (meant := _meant(error.input, expected, error, marks)):
+        return f"write `{error.path[-1] if error.path else 'LIST'}: {meant}`"
     if expected in ("a mapping", "a list") and (fix := _indentation(error) or _only_key(error, marks)):
         return fix
     if error.kind in ("literal_error", "enum"):
@@ -453,6 +454,16 @@ def _text_for_number(error: _Error) -> str:
         return perhaps_meant(str(error.input))
     is_device = error.path[-1:] == ("port",)  # no port is a number
     return (_example(error) if is_device else "") or f'put it in quotes: "{text_of(error.input)}"'
+
+
+def _meant(text: str, expected: str, error: _Error, marks: Marks) -> str:
+    """Return the value that a text means: a list, `true` for `yes`, 0.3 for `30%`; else an empty text."""
+    if expected == "a list":
+        return _items(text, error, marks)
+    if expected == _BOOL:
+        return _SWITCHES.get(text.lower(), "")
+    parts = split_quantity(text) if expected == _NUMBER else None
+    return f"{float(parts[0]) / 100:g}" if parts is not None and parts[1] == "%" else ""
 
 
 def _items(text: str, error: _Error, marks: Marks) -> str:
