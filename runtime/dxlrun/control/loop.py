@@ -188,7 +188,8 @@ class ControlLoop:
                 return "fault", self._actions.ending[1]
             self._one()
             if self._next():
-                return "fault", texts.overrun_ends_run(self.record.cycle)
+                what = f"cycle {self.record.cycle} ended after the next deadline"
+                return "fault", f"{what} (`overrun: stop` in the robot file)"
         return "fault", self.manager.switching.fault
 
     def _one(self) -> None:
@@ -251,7 +252,8 @@ class ControlLoop:
             except PortError:
                 raise
             except (Exception, SystemExit) as error:  # foreign code: the run ends by the steps of its policy
-                self._actions.end_run("on_fault", texts.monitor_failed(type(monitor), error))
+                name, module, kind = type(monitor).__name__, type(monitor).__module__, type(error).__name__
+                self._actions.end_run("on_fault", f"the monitor {name} of {module} raised {kind}: {error}")
         commands = steering.inbox.drain_commands()
         if commands or steering.paused_until_ns or steering.halt.waiting or manager.streams:
             record.command_count = steering.execute_commands(commands)
@@ -362,7 +364,7 @@ class Overruns:
             except BaseException as error:  # foreign code must not end the loop
                 if is_interrupt(error):
                     raise
-                self._dismiss(hook, texts.raised(error))
+                self._dismiss(hook, f"raised {type(error).__name__}: {error}")
                 continue
             if answer is None:
                 continue

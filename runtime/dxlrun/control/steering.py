@@ -193,7 +193,7 @@ class Steering:
         for name in self._manager.stale(self._record.woken_ns):
             if not (ends := self._stale(f"the stream of commands for {name} ended")):
                 self._manager.hold_controller(name)
-            event, data = texts.stream_expired(ends or texts.JOINTS_HELD), StreamEnd(held=not ends)
+            event, data = texts.stream_expired(ends or "its joints are held"), StreamEnd(held=not ends)
             self._context.events.emit_event(name, event, msgspec.json.encode(data))
 
     def refuse_commands(self) -> None:
@@ -286,7 +286,8 @@ class Steering:
         Returns: The refusal if the loop is not paused, else None.
         """
         if not self.paused:
-            return Refusal(Code.NOT_PAUSED, {} if self._commanding() else {"hint": texts.NOTHING_ACTIVE})
+            hint = "no controller commands its joints; activate one by `dxlrun switch --activate NAME`"
+            return Refusal(Code.NOT_PAUSED, {} if self._commanding() else {"hint": hint})
         self.paused_until_ns = 0
         self.anchoring.end_pause()
         self._gate.ease_in()

@@ -249,32 +249,6 @@ def servo_limits_gone(joint: str) -> str:
     return f"{joint}: servo registers no longer limit goals"
 
 
-# Reasons: the end of a run, and of a hook
-
-
-def overrun_ends_run(cycle: int) -> str:
-    return f"cycle {cycle} ended after the next deadline (`overrun: stop` in the robot file)"
-
-
-def monitor_failed(monitor: type, error: BaseException) -> str:
-    return f"the monitor {monitor.__name__} of {monitor.__module__} {raised(error)}"
-
-
-def raised(error: BaseException) -> str:
-    return f"raised {type(error).__name__}: {error}"
-
-
-# Refusals: problems and hints; their sentences are in `channels/answers.py`
-
-WRONG_MOTION_SIZES = "the motion's array does not match the sizes of its parts"
-
-
-def no_single_goal(controller: str) -> str:
-    return f"the motion has other goals for {controller} than a single one at its start"
-
-
 # Consequences of commands that do not come any more
 
 PAUSE_EXPIRED = "no client ended the pause"
-JOINTS_HELD = "its joints are held"
-NOTHING_ACTIVE = "no controller commands its joints; activate one by `dxlrun switch --activate NAME`"

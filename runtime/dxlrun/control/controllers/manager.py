@@ -445,13 +445,15 @@ class Manager:
         sizes = [size for part in parts for size in part.sizes]
         fits = all(size >= 0 for size in sizes) and 8 * sum(sizes) == len(numbers)
         if not fits or any(len(part.at_ns) != len(part.sizes) for part in parts):
-            return Refusal(Code.INVALID, {"problem": texts.WRONG_MOTION_SIZES})
+            problem = "the motion's array does not match the sizes of its parts"
+            return Refusal(Code.INVALID, {"problem": problem})
         for part in parts:
             managed = self._commandable(part.controller)
             if isinstance(managed, Refusal):
                 return managed
             if not part.sizes or (part.kind in managed.controller.Goals and part.at_ns != (0,)):
-                return Refusal(Code.INVALID, {"problem": texts.no_single_goal(part.controller)})
+                problem = f"the motion has other goals for {part.controller} than a single one at its start"
+                return Refusal(Code.INVALID, {"problem": problem})
         commands = np.split(np.frombuffer(numbers, dtype="<f8"), np.cumsum(sizes)[:-1])
         begun: list[int] = []
         for part in parts:
