@@ -93,8 +93,8 @@ class CycleCauses:
         Raises:
             LogError: A packet or a machine sample in the slice cannot be read.
         """
-        plan = plan_of(log)
         if self._newest is None:
+            plan = plan_of(log)
             self._buses = tuple(plan.by_name.get(name, LoggedBus(name)) for name in log.buses)
             self._controllers = tuple(controller.name for controller in log.controllers)
             self._sequential = plan.loop.schedule == "sequential"

@@ -65,7 +65,7 @@ class ConductHistory:
 
     def __init__(self) -> None:
         self._begin_ns: int | None = None
-        self._goals = GoalHistory()
+        self._plan, self._goals = LoggedPlan(), GoalHistory()
         self._ends: set[int] = set()  # LOOP_STARTED and LOOP_STOPPED, if the log has them
         self._takeovers: list[Takeover] = []
         self._pending: list[Event] = []  # Faults of controllers without a takeover so far
@@ -73,10 +73,10 @@ class ConductHistory:
 
     def add_slice(self, log: Log) -> None:
         """Add the events and IMU values of the next slice of the log."""
-        if self._begin_ns is None and begins(log):
-            self._begin_ns = first_deadline_ns(log)
-        plan = plan_of(log)
-        self._goals.planned = plan.loop.origins
+        if self._begin_ns is None:
+            self._plan = plan_of(log)
+            self._goals.planned = self._plan.loop.origins
+            self._begin_ns = first_deadline_ns(log) if begins(log) else None
         for event in log.events:
             if event.code in _GOALS:
                 with suppress(*UNREADABLE):
@@ -84,22 +84,22 @@ class ConductHistory:
             elif event.code in _ENDS:
                 self._ends.add(event.code)
             elif event.code == EventCode.TAKEOVER:
-                fell = plan.controller(event.source).type == "fall_reflex"
+                fell = self._plan.controller(event.source).type == "fall_reflex"
                 self._take_over(event, "", fell)
             elif event.code == EventCode.CONTROLLER_FAULT:
                 self._pending.append(event)
             elif event.code == EventCode.CONTROLLER_ACTIVATED:
-                self._activated(event, plan)
+                self._activated(event)
         gravity = _gravity(log)
         self._first = np.concatenate([self._first, gravity[: _SOME - len(self._first)]])
         self._last = np.concatenate([self._last, gravity[-_SOME:]])[-_SOME:]
 
-    def _activated(self, event: Event, plan: LoggedPlan) -> None:
+    def _activated(self, event: Event) -> None:
         """Record a takeover if the activated controller is the fallback of a failed one, or the fallback
         of another controller in its place."""
-        fallbacks = {one.fallback for one in plan.loop.controllers}
+        fallbacks = {one.fallback for one in self._plan.loop.controllers}
         for failed in self._pending:
-            own = plan.controller(failed.source).fallback
+            own = self._plan.controller(failed.source).fallback
             if event.source == own or (event.source in fallbacks and event.source != failed.source):
                 self._take_over(failed, event.source)
                 self._pending.remove(failed)

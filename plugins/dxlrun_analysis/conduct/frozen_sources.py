@@ -149,7 +149,7 @@ class FrozenSources:
 
     def add_slice(self, log: Log) -> None:
         """Add the source values in the cycles of the next slice of the log."""
-        if not len(log.cycles):
+        if not len(log.cycles) or not log.header.sources:
             return
         self._plan, self._states = plan_of(log), dict(log.header.sources)
         known = {source.name for source in self._plan.loop.sources}

@@ -145,18 +145,22 @@ def cycle_periods_ns(log: Log) -> NDArray[np.int64]:
     """
     if len(log.cycles) < 2:
         return np.full(len(log.cycles), log.period_ns, dtype=np.int64)
-    between = _between_ns(log, log.cycles)
+    between = _between_ns(log.cycles, sequential=_is_sequential(log))
     return np.append(between, between[-1])
 
 
-def _between_ns(log: Log, cycles: NDArray[np.void]) -> NDArray[np.int64]:
+def _is_sequential(log: Log) -> bool:
+    return plan_of(log).loop.schedule == "sequential"
+
+
+def _between_ns(cycles: NDArray[np.void], *, sequential: bool) -> NDArray[np.int64]:
     """Return the time from each cycle's deadline to the next deadline, ns, shape (cycles - 1,); a mean across
     missing cycles.
 
     In a sequential schedule it counts from the wake-up of a cycle, not from its deadline.
     """
     due = cycles["scheduled_ns"]
-    counted_from = cycles["woken_ns"] if plan_of(log).loop.schedule == "sequential" else due
+    counted_from = cycles["woken_ns"] if sequential else due
     between: NDArray[np.int64] = (due[1:] - counted_from[:-1]) // np.maximum(np.diff(cycles["cycle"]), 1)
     return between
 
@@ -217,7 +221,7 @@ class Punctuality:
         self._records = self._skipped = self._elapsed = 0
         self._agree = True
         self._start = 0  # Number of the first period that counts
-        self._first = True
+        self._first, self._sequential = True, False
         self._begin_ns = self._from_ns = self._end_ns = 0
         self._nominal_ns = self._period_ns = 1
         self._sum = self._squares = self._max_ns = 0
@@ -232,6 +236,7 @@ class Punctuality:
         if self._first:
             self._begin_ns = self._from_ns = first_deadline_ns(log)
             self._nominal_ns = self._period_ns = log.period_ns
+            self._sequential = _is_sequential(log)
             self._first = not begins(log)
         cycles = log.cycles[list(_TIMES)].astype(_WHOLE)
         cycles = cycles if self._held is None else np.concatenate([self._held, cycles])
@@ -243,7 +248,7 @@ class Punctuality:
             self._from_ns = int(first["scheduled_ns"] - first["skipped"] * log.period_ns)
         self._held = cycles[-1:].copy()
         if len(cycles) > 1:
-            self._count(cycles[:-1], _between_ns(log, cycles))
+            self._count(cycles[:-1], _between_ns(cycles, sequential=self._sequential))
 
     def _count(self, cycles: NDArray[np.void], each: NDArray[np.int64]) -> None:
         numbers, skipped = cycles["cycle"], cycles["skipped"]

@@ -267,13 +267,15 @@ def _unasked(replies: Replies, due: DueReplies, to: Numbers) -> Numbers:
     """
     rows = np.flatnonzero(replies.strange)
     exchange, servo = replies.exchange[rows], replies.servo[rows]
-    if not len(rows):
+    foreign = (to[exchange] >= 0) & (to[exchange] != servo % IDS)
+    exchange, servo = exchange[foreign], servo[foreign]
+    if not len(servo):
         return servo
     asked = np.append((due.servo << _ROWS) + due.exchange, -1)
     order = np.argsort(asked)
     last = order[np.searchsorted(asked[order], (servo << _ROWS) + exchange, side="right") - 1]
     owed = (asked[last] >> _ROWS == servo) & (np.append(due.reply, -1)[last] < 0)
-    unasked: Numbers = servo[(to[exchange] >= 0) & (to[exchange] != servo % IDS) & ~owed]
+    unasked: Numbers = servo[~owed]
     return unasked
 
 
