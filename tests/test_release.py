@@ -47,7 +47,6 @@ OBJECTS = {
         "dxl_source",
     },
     "dxlrun_analysis/libcounts.so": {"counts_add", "counts_merge", "dxl_source"},
-    "dxlrun_analysis/servos/libjoint_states.so": {"joint_states_bin", "dxl_source"},
     "dxlrun_analysis/joints/libmovement.so": {"movement_add", "dxl_source"},
     "dxlrun_analysis/servos/libpairing.so": {"pairing_split", "pairing_pair_replies", "dxl_source"},
 }

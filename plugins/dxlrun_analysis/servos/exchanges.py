@@ -266,11 +266,11 @@ def _unasked(replies: Replies, due: DueReplies, to: Numbers) -> Numbers:
     missing.
     """
     rows = np.flatnonzero(replies.strange)
+    asked_id = to[replies.exchange[rows]]
+    rows = rows[(asked_id >= 0) & (asked_id != replies.servo[rows] % IDS)]
     exchange, servo = replies.exchange[rows], replies.servo[rows]
-    foreign = (to[exchange] >= 0) & (to[exchange] != servo % IDS)
-    exchange, servo = exchange[foreign], servo[foreign]
-    if not len(servo):
-        return servo
+    if not len(rows):
+        return np.zeros(0, np.int64)
     asked = np.append((due.servo << _ROWS) + due.exchange, -1)
     order = np.argsort(asked)
     last = order[np.searchsorted(asked[order], (servo << _ROWS) + exchange, side="right") - 1]

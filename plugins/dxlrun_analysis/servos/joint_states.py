@@ -1,43 +1,41 @@
-"""Angle, speed and temperature of each joint in each cycle as bins, to relate missing replies to them."""
+"""Angle, speed and temperature of each joint as bins, to relate missing replies to them.
+
+States are sampled 50 times a second at most: joints do not change much in 20 ms.
+"""
 
 from __future__ import annotations
 
-import ctypes
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cache
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dxlrun import LINEAR, Floats, Log
-from dxlrun.tooling.compiled_code import load_compiled, parse_structs
 from dxlrun.tooling.records import OFFLINE
 from dxlrun_analysis.plan_excerpt import LoggedPlan
 
 Numbers = NDArray[np.int64]
 
-SOURCE = Path(__file__).with_name("joint_states.c")
-_STRUCTS = parse_structs(SOURCE.read_text())
 _IDS = 256
 BINS = 200  # Angles of -500 to 500 deg, speeds to 20 rad/s, temperatures to 200 deg C
 QUANTITIES = ANGLE, SPEED, TEMPERATURE = range(3)
-_STEPS = np.array([math.radians(5), 0.1, 1.0])  # rad, rad/s, deg C: width of a bin
-_FIRST = np.array([-BINS / 2, 0, 0])  # Lower edge of the first bin, in bin widths
-_MOST_HELD = 200_000  # Cycles that wait for their exchanges; in a complete log they cover 20 s
+_STEPS = np.array([math.radians(5), 0.1, 1.0])[:, None, None]  # rad, rad/s, deg C: width of a bin
+_FIRST = np.array([-BINS / 2, 0, 0])[:, None, None]  # Lower edge of the first bin, in bin widths
+_SAMPLE_NS = 20_000_000
+_MOST_HELD = 10_000  # Samples that wait for their exchanges; in a complete log they cover 20 s
 _USABLE = ~np.isin(np.arange(256), OFFLINE)  # By the value of `torque`
 
 
 @dataclass(frozen=True, slots=True)
 class Places:
-    """Angle, speed and temperature of all joints in some cycles, as bin numbers."""
+    """Angle, speed and temperature of all joints in sampled cycles, as bin numbers."""
 
     cycle: Numbers = field(default_factory=lambda: np.zeros(0, np.int64))
     """Numbers of the cycles, ascending; shape (cycles,)."""
     bins: NDArray[np.int16] = field(default_factory=lambda: np.zeros((len(QUANTITIES), 0, 0), np.int16))
-    """Bin of each quantity; -1 if unknown or offline; shape (quantities, joints, cycles)."""
+    """Bin of each quantity; -1 if unknown or offline; shape (quantities, cycles, joints)."""
 
 
 class JointStates:
@@ -54,7 +52,7 @@ class JointStates:
         self.share = np.ones(len(joints))
         """m of a linear joint per rad of its servo, whose angle is binned; 1 for a rotary joint."""
         self.time_ns = np.zeros((len(joints), len(QUANTITIES), BINS), np.int64)  # Time spent in each bin
-        self._held: list[tuple[Numbers, Numbers, Floats, NDArray[np.bool_], Floats]] = []
+        self._held: list[tuple[Numbers, Numbers, Floats, Floats, NDArray[np.bool_]]] = []
         indices = {name: index for index, name in enumerate(buses)}
         rows = {name: row for row, name in enumerate(joints)}
         plan = plan or LoggedPlan()
@@ -66,46 +64,43 @@ class JointStates:
                     self.share[rows[name]] = share
 
     def add_states(self, log: Log) -> None:
-        """Keep the joint states of the next slice of the log."""
+        """Keep samples of the joint states in the next slice of the log."""
         cycles = log.cycles
+        cycles = cycles[cycles["cycle"] % _cycles_per_sample(cycles["period_ns"]) == 0]
         if not len(cycles):
             return
-        # Joint by joint in memory, so that each is read without gaps.
-        angle, heat = (np.array(cycles[name].T, order="C") for name in ("position", "temperature"))
-        angle /= self.share[:, None]
-        angle[~cycles["valid"].T] = np.nan
-        usable = _USABLE[np.array(cycles["torque"].T, order="C")]
-        self._held.append((cycles["cycle"].copy(), cycles["period_ns"].copy(), angle, usable, heat))
+        angle = np.where(cycles["valid"], cycles["position"] / self.share, np.nan)
+        usable = _USABLE[cycles["torque"]]
+        self._held.append((cycles["cycle"], cycles["period_ns"], angle, cycles["temperature"], usable))
         while len(self._held) > 1 and sum(len(part[0]) for part in self._held) > _MOST_HELD:
             self._held.pop(0)
 
     def until(self, cycle: int, *, everything: bool = False) -> Places:
-        """Remove the states up to and including a cycle (or `everything`) from the buffer, count them, and
+        """Remove the samples up to and including a cycle (or `everything`) from the buffer, count them, and
         return them as bins. Missing angles are interpolated."""
         if not self._held:
             return Places()
-        numbers, period_ns, angle, usable, heat = (
-            np.concatenate(part, axis=-1) for part in zip(*self._held, strict=True)
-        )
+        numbers, period_ns, angle, heat, usable = map(np.concatenate, zip(*self._held, strict=True))
         end = len(numbers) if everything else int(np.searchsorted(numbers, cycle, side="right"))
-        bins = np.empty((len(QUANTITIES), len(angle), end), np.int16)
-        states = {"cycle": numbers, "period_ns": period_ns, "angle": angle, "heat": heat, "usable": usable}
-        table = {"step": _STEPS, "first": _FIRST, "at": bins, "time_ns": self.time_ns}
-        size = {"until": end, "quantities": len(QUANTITIES), "bins": BINS}
-        structures = (
-            _STRUCTS[name](**{key: one.ctypes.data for key, one in columns.items()}, **counts)
-            for name, columns, counts in (
-                ("States", states, {"count": len(numbers), "joints": len(angle)}),
-                ("Bins", table, size),
-            )
-        )
-        _library().joint_states_bin(*map(ctypes.byref, structures))
-        self._held = [(numbers[end:], period_ns[end:], angle[:, end:], usable[:, end:], heat[:, end:])]
+        for column in angle.T:
+            known = np.isfinite(column)
+            if known.any():
+                column[~known] = np.interp(numbers[~known], numbers[known], column[known])
+        self._held = [(numbers[end:], period_ns[end:], angle[end:], heat[end:], usable[end:])]
+        speed = np.full_like(angle, np.nan)
+        took_s = (numbers[2:] - numbers[:-2]) * period_ns[1:-1] * 1e-9
+        speed[1:-1] = np.abs(angle[2:] - angle[:-2]) / np.maximum(took_s, 1e-9)[:, None]
+        values = np.stack([angle, speed, heat])[:, :end]
+        bins = np.clip(np.floor(values / _STEPS) - _FIRST, 0, BINS - 1)
+        bins = np.where(np.isfinite(values) & usable[:end], bins, -1).astype(np.int16)
+        quantity, row, joint = np.nonzero(bins >= 0)
+        spent_ns = (period_ns * _cycles_per_sample(period_ns))[row]
+        np.add.at(self.time_ns, (joint, quantity, bins[quantity, row, joint]), spent_ns)
         return Places(numbers[:end], bins)
 
     def range_text(self, joint: int, quantity: int, low: int, high: int) -> str:
         """Return a range of bins of one quantity as text: `between 30 and 45 deg`; `high` is included."""
-        begin, end = ((at + _FIRST[quantity]) * _STEPS[quantity] for at in (low, high + 1))
+        begin, end = ((at + _FIRST[quantity].item()) * _STEPS[quantity].item() for at in (low, high + 1))
         if quantity == TEMPERATURE:
             return f"from {begin:.0f} deg C on" if high == BINS - 1 else f"at {begin:.0f} to {end:.0f} deg C"
         share = float(self.share[joint])
@@ -115,8 +110,6 @@ class JointStates:
         return f"between {begin * factor:.0f} and {end * factor:.0f} {unit}"
 
 
-@cache
-def _library() -> ctypes.CDLL:
-    found = load_compiled(SOURCE, ctypes.CDLL)
-    found.joint_states_bin.argtypes, found.joint_states_bin.restype = (ctypes.c_void_p,) * 2, None
-    return found
+def _cycles_per_sample(period_ns: Numbers) -> Numbers:
+    cycles: Numbers = np.maximum(_SAMPLE_NS // np.maximum(period_ns, 1), 1)
+    return cycles

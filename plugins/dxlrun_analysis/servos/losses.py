@@ -136,7 +136,7 @@ class Losses:
         self._answered += came
         self._answers += came.reshape(-1, IDS).sum(axis=1)
         joint = self._states.joint_of[due.servo[rows]]
-        at = np.searchsorted(places.cycle, exchanges.cycle[exchange[rows]])
+        at = np.searchsorted(places.cycle, exchanges.cycle[exchange[rows]], side="right") - 1
         columns = (rows, cycles, own, nothing, joint, at, answers, answered)
         missed = zip(*(column.tolist() for column in columns), strict=True)
         for row, cycle, is_own, whole, of, place, seen, now in missed:
@@ -146,8 +146,8 @@ class Losses:
                 if at_ns - out.at_ns <= _APART_NS:
                     out.last, out.last_answers = cycle, seen
             elif (is_own or whole) and len(self._outages) < _MOST_KEPT:
-                known = of >= 0 and place < len(places.cycle)
-                where = places.bins[:, of, place].tolist() if known else [-1] * len(QUANTITIES)
+                known = of >= 0 and len(places.cycle)
+                where = places.bins[:, max(place, 0), of].tolist() if known else [-1] * len(QUANTITIES)
                 out = _Outage(servo, at_ns, cycle, where, seen, now, whole, cycle, seen)
                 self._open[servo] = out
                 self._outages.append(out)
