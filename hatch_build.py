@@ -39,7 +39,7 @@ SOURCES = tuple(
     for source in sorted(ROOT.glob(pattern))
 )
 """Each is compiled into an object of its own, which lies beside it: libkernel.so."""
-FLAGS = ("-std=c11", "-O2", "-fPIC", "-shared", "-ffp-contract=off", "-Wall", "-Wextra", "-Wconversion")
+FLAGS = ("-std=c11", "-O3", "-fPIC", "-shared", "-ffp-contract=off", "-Wall", "-Wextra", "-Wconversion")
 """No contraction into fused operations: states and goals have the same bits on every processor."""
 
 

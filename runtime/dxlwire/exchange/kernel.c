@@ -603,9 +603,11 @@ static int take(Kernel *k, Line *l, int32_t count, int64_t at)
     /* More bytes than planned, or too many fragments to keep the time of each one: the parser takes over. */
     if (l->have > r->size || (l->have < r->size && l->pieces == MOST_PIECES))
         return UNEXPECTED;
+    uint8_t wrong = 0; /* without a branch for each byte, so that the compiler compares many at once */
     for (int32_t i = from; i < l->have; i++)
-        if ((l->buffer[i] ^ r->expected[i]) & r->known[i])
-            return UNEXPECTED;
+        wrong |= (uint8_t)((l->buffer[i] ^ r->expected[i]) & r->known[i]);
+    if (wrong)
+        return UNEXPECTED;
     if (l->have < r->size) {
         if (r->firm_size && l->have >= r->firm_size &&
             (r->fast || (!is_early(l, r) && sums_are_right(l, r, r->firm_size))))
@@ -821,19 +823,22 @@ static int32_t goal_tick(const Cell *c, double goal, double ceiling)
     return exact < c->low ? c->low : exact > c->high ? c->high : c->free;
 }
 
-/* Append a byte of the parameters with byte stuffing: FF FF FD is followed by another FD. */
-static int32_t put(uint8_t *packet, int32_t size, uint8_t byte)
+/* Stuff the parameters of a packet in place: FF FF FD is followed by another FD. Return the packet's size. */
+static int32_t stuff(uint8_t *packet, int32_t size)
 {
-    packet[size++] = byte;
-    if (byte == 0xfd && size >= 10 && packet[size - 2] == 0xff && packet[size - 3] == 0xff)
-        packet[size++] = 0xfd;
+    for (int32_t at = 10; at < size; at++)
+        if (packet[at] == 0xfd && packet[at - 1] == 0xff && packet[at - 2] == 0xff) {
+            memmove(packet + at + 1, packet + at, (size_t)(size++ - at));
+            at++;
+        }
     return size;
 }
 
 /* Build the sync write of the goals that are due. Return its size, 0 if no goal is due. */
 static int32_t build(Kernel *k, const Line *l, SyncWrite *w, uint8_t *packet)
 {
-    int32_t size = 0;
+    const int32_t head = l->protocol == 1 ? 7 : 12;
+    int32_t size = head;
     int64_t cycle = ++w->cycle;
     for (int32_t m = 0; m < w->count; m++) {
         int32_t index = w->members[m], row = w->rows[m], *ticks = w->ticks + m * w->items;
@@ -854,42 +859,28 @@ static int32_t build(Kernel *k, const Line *l, SyncWrite *w, uint8_t *packet)
         if (!due)
             continue;
         w->sent_at[m] = cycle;
-        uint8_t record[256];
-        memset(record + 1, 0, (size_t)w->length);
+        uint8_t *record = packet + size;
+        memset(record, 0, (size_t)(1 + w->length));
         record[0] = w->ids[m];
         for (int32_t c = 0; c < w->items; c++)
             for (int32_t b = 0; b < cells[c].size; b++)
                 record[1 + cells[c].at + b] = (uint8_t)((uint32_t)ticks[c] >> 8 * b);
-        if (l->protocol == 1) {
-            if (!size) {
-                const uint8_t head[7] = {0xff, 0xff, 0xfe, 0, 0x83, (uint8_t)w->address, (uint8_t)w->length};
-                memcpy(packet, head, 7);
-                size = 7;
-            }
-            memcpy(packet + size, record, (size_t)(1 + w->length));
-            size += 1 + w->length;
-        } else {
-            if (!size) {
-                const uint8_t head[8] = {0xff, 0xff, 0xfd, 0, 0xfe, 0, 0, 0x83};
-                memcpy(packet, head, 8);
-                size = put(packet, 8, (uint8_t)w->address);
-                size = put(packet, size, (uint8_t)(w->address >> 8));
-                size = put(packet, size, (uint8_t)w->length);
-                size = put(packet, size, (uint8_t)(w->length >> 8));
-            }
-            for (int32_t b = 0; b < 1 + w->length; b++)
-                size = put(packet, size, record[b]);
-        }
+        size += 1 + w->length;
     }
-    if (!size)
+    if (size == head)
         return 0;
     if (l->protocol == 1) {
         uint8_t sum = 0;
-        packet[3] = (uint8_t)(size - 3);
+        const uint8_t start[7] = {0xff, 0xff, 0xfe, (uint8_t)(size - 3), 0x83, (uint8_t)w->address, (uint8_t)w->length};
+        memcpy(packet, start, 7);
         for (int32_t i = 2; i < size; i++)
             sum = (uint8_t)(sum + packet[i]);
         packet[size++] = (uint8_t)~sum;
     } else {
+        const uint16_t place[2] = {(uint16_t)w->address, (uint16_t)w->length};
+        memcpy(packet, (const uint8_t[]){0xff, 0xff, 0xfd, 0, 0xfe, 0, 0, 0x83}, 8);
+        memcpy(packet + 8, place, 4);
+        size = stuff(packet, size);
         packet[5] = (uint8_t)(size - 5);
         packet[6] = (uint8_t)((size - 5) >> 8);
         uint16_t crc = crc16(0, packet, size);
