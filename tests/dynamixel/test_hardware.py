@@ -410,7 +410,6 @@ def test_the_heart_beats_while_a_lost_line_is_awaited_at_the_end():
     assert np.diff([*rig.beats, rig.clock.now_ns()]).max() <= 21 * MS
 
 
-MIXED = ("AX-12A", "MX-64", "MX-28", "AX-12A", "MX-64")
 FAST_SYNC_READ = protocol2.Protocol2Instruction.FAST_SYNC_READ
 SYNC_READ = protocol2.Protocol2Instruction.SYNC_READ
 
@@ -423,7 +422,7 @@ def fast():
 @pytest.fixture
 def mixed():
     """MX servos with old firmware, which know a bulk read, beside AX on the same line."""
-    return start_rig(make_plan((1, 2, 3, 4, 5), models=MIXED, lower=-2.0, upper=2.0))
+    return start_rig(MX)
 
 
 def passed(rig, since, direction):
@@ -571,7 +570,8 @@ def test_mx_are_read_together_and_ax_one_by_one_with_a_latency_for_each_request(
     ]
     assert goals[4:7] == bytes((0x83, 30, 4))
     assert mixed.states.valid.all()
-    budget = make_plan((1, 2, 3, 4, 5), models=MIXED, latency_ns=1_000_000).budget
+    models = [servo.model for servo in MX.servos]
+    budget = make_plan((1, 2, 3, 4, 5), models=models, latency_ns=1_000_000).budget
     assert (budget.latency_ns, budget.reply_bytes) == (3_000_000, 5 * 12)
     assert budget.request_bytes == 2 * 8 + (7 + 3 * 3) + (8 + 5 * 5)
 

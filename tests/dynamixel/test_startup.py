@@ -252,28 +252,9 @@ def test_a_warning_neither_takes_the_goals_nor_marks_the_joint_as_broken():
     assert [ids for _, ids in rig.goals_sent(since)] == [[1, 2]]
 
 
-@pytest.fixture
-def plain_table():
-    """The text of a table of Protocol 2.0 that names no errors, as a plug-in may have it."""
+def test_a_table_without_errors_names_none():
+    """As a plug-in may have one of Protocol 2.0."""
     text = (table_files._TABLES / "protocol2/XM/XM430-W350.toml").read_text("utf-8")
     before, _, rest = text.partition("[errors]")
-    return f"{before}[items]{rest.partition('[items]')[2]}"
-
-
-@pytest.mark.parametrize(
-    ("entries", "said"),
-    [
-        ("overload = 3", "overload = 3 is not a single bit from 1 to 128"),
-        ("overload = 256", "overload = 256 is not a single bit from 1 to 128"),
-        ("overload = 1\noverheating = 1", "two errors have the same value"),
-        ('overload = "1"', "overload is not a whole number"),
-    ],
-)
-def test_errors_that_cannot_be_are_refused(entries, said, plain_table):
-    with pytest.raises(ValueError, match=said):
-        read_control_table(f"{plain_table}\n[errors]\n{entries}\n")
-
-
-def test_a_table_without_errors_names_none(plain_table):
-    errors = read_control_table(plain_table).errors
+    errors = read_control_table(f"{before}[items]{rest.partition('[items]')[2]}").errors
     assert errors.describe_errors(0x20) == "bits 20, not defined in the control table"

@@ -46,7 +46,7 @@ def disturb_replies(bus: SimulatedBus, servo_id: int, faults: Mapping[int, Packe
         count += 1
         return fault
 
-    _choose_faults(bus, servo_id, next_fault)
+    change_replies(bus, lambda replying, reply: next_fault(reply) if replying == servo_id else None)
     return lambda: count
 
 
@@ -62,13 +62,6 @@ def change_replies(bus: SimulatedBus, choose: Callable[[int, DisturbedReply], Pa
     bus._fault_of = chosen  # type: ignore[method-assign]
     for servo in bus.servos:
         bus._line.disturbed[servo.servo_id] = 1
-
-
-def _choose_faults(
-    bus: SimulatedBus, servo_id: int, choose: Callable[[DisturbedReply], PacketFault | None]
-) -> None:
-    """Ask for a fault of each reply of a servo from now on."""
-    change_replies(bus, lambda replying, reply: choose(reply) if replying == servo_id else None)
 
 
 def watch_instructions(bus: SimulatedBus, watch: Callable[[InstructionPacket, int], None]) -> None:
@@ -117,8 +110,8 @@ def turn_by_hand(servo: SimulatedServo, angle: float) -> None:
 def lose_replies(bus: SimulatedBus, servo_id: int, begin_ns: int, end_ns: int) -> None:
     """Lose every reply of a servo that would begin in a time; the servo still executes its instructions."""
 
-    def lost(reply: DisturbedReply) -> PacketFault | None:
-        outside = not begin_ns <= reply.first_ns < end_ns
-        return None if outside else PacketFault("its reply cut to 0 bytes", lambda _: b"")
+    def lost(replying: int, reply: DisturbedReply) -> PacketFault | None:
+        is_lost = replying == servo_id and begin_ns <= reply.first_ns < end_ns
+        return PacketFault("its reply cut to 0 bytes", lambda _: b"") if is_lost else None
 
-    _choose_faults(bus, servo_id, lost)
+    change_replies(bus, lost)

@@ -74,19 +74,15 @@ def make_plan(
     protocol = change.get("protocol", 1.0)
     models = change.get("models") or [change.get("model", "AX-12A")] * len(ids)
     names = change.get("joints", [f"{name}_{servo_id}_joint" for servo_id in ids])
+    usual: dict[str, Any] = {"reference": MIDDLE, "lower": -MIDDLE, "upper": MIDDLE}
+    given = usual | {key: value for key, value in change.items() if key in Wiring.__struct_fields__}
     wiring = [
         Wiring(
             joint=names[index],
             row=first_row + index,
             servo_id=servo_id,
             table=find_table(models[index], protocol),
-            reference=change.get("reference", MIDDLE),
-            direction=change.get("direction", 1 if index % 2 else -1),
-            lower=change.get("lower", -MIDDLE),
-            upper=change.get("upper", MIDDLE),
-            continuous=change.get("continuous", False),
-            start_mode=change.get("start_mode"),
-            ratio=change.get("ratio", 1.0),
+            **{"direction": 1 if index % 2 else -1} | given,
         )
         for index, servo_id in enumerate(ids)
     ]
