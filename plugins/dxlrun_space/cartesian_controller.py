@@ -6,7 +6,7 @@ import math
 from collections.abc import Generator, Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Annotated, ClassVar, Final, TypeAlias, cast
+from typing import Annotated, ClassVar, Final, Literal, TypeAlias, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,7 +47,7 @@ from dxlrun_space.path import (
     plan_positions,
     remark_on,
 )
-from dxlrun_space.solver import Orientation, Solver, demands_orientation, distance, residual_of
+from dxlrun_space.solver import FULL, Solver, distance, residual_of
 from dxlrun_space.space_goals import PoseCommand, TipGoal, TipTwist, TwistCommand, packed, unpacked
 from dxlrun_space.stream import TipMotion, Twist
 
@@ -112,7 +112,7 @@ class CartesianParameters(ParametersModel):
     """Link of the URDF in whose axes poses are; empty: the root."""
     linear: TranslationLimits = TranslationLimits()
     angular: RotationLimits = RotationLimits()
-    orientation: Orientation | None = None
+    orientation: Literal["exact", "nearest"] | None = None
     """`exact` refuses a pose whose orientation cannot be reached; `nearest` reaches the position first. By
     default `exact` with six joints or more."""
     posture: Mapping[str, Angle] = {}
@@ -569,7 +569,8 @@ class CartesianController(Controller[CartesianParameters]):
 
 
 def _is_exact(parameters: CartesianParameters) -> bool:
-    return demands_orientation(parameters.orientation, len(parameters.joints))
+    by_default = "exact" if len(parameters.joints) >= FULL else "nearest"
+    return (parameters.orientation or by_default) == "exact"
 
 
 def _remark(path: Path, asked: TipGoal) -> str:

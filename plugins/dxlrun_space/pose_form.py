@@ -61,8 +61,8 @@ class TipPose(Form):
     y: _Place = key("Position of the tip.", "0 cm")
     z: _Place = key("Position of the tip.", "15 cm")
     rpy: _Turns | None = key(
-        "Roll, pitch and yaw. Without it any orientation. With fewer than six joints the nearest one that "
-        "they reach; `dxlrun check`, and the goal of a `cartesian_controller`, report the difference.",
+        "Roll, pitch and yaw. Without it any orientation. If the joints do not reach it, the nearest one: "
+        "`dxlrun check` reports the difference; `orientation` of a `cartesian_controller` may refuse it.",
         "[0 deg, 40 deg, 0 deg]",
         None,
     )
@@ -95,7 +95,7 @@ def _solve(pose: TipPose, urdf: str | None, joints: Mapping[str, tuple[float, fl
     # Imported here, because most robot files have no pose of a link.
     from dxlrun_space.chain import BASE, WrongChain, chain_of
     from dxlrun_space.path import out_of_reach, remark_on
-    from dxlrun_space.solver import Solver, demands_orientation, finish_search
+    from dxlrun_space.solver import Solver, finish_search
 
     chain = chain_of(urdf, pose.base, pose.tip)
     for joint in pose.near:
@@ -106,13 +106,11 @@ def _solve(pose: TipPose, urdf: str | None, joints: Mapping[str, tuple[float, fl
     solver = Solver(chain, lower, upper, near)
     start = tuple(each or 0.0 for each in near)
     rotation = rotation_of(pose.quaternion, pose.rpy)
-    exact = rotation is not None and demands_orientation(None, len(near))
     target = Transform((pose.x, pose.y, pose.z), rotation or BASE.rotation)
-    search = solver.search(target, start, exact=exact) if rotation else solver.search_place(target, start)
+    search = solver.search(target, start, exact=False) if rotation else solver.search_place(target, start)
     found = finish_search(search)
-    if not found.residual.suffices(exact):
-        fix = "move the pose, or give it another orientation" if exact else "move the pose"
-        raise WrongChain("", out_of_reach(found.residual, exact), fix)
+    if not found.residual.suffices(exact=False):
+        raise WrongChain("", out_of_reach(found.residual, exact=False), "move the pose")
     return SolvedPose(
         dict(zip(chain.joints, found.positions, strict=True)),
         remark_on(found.residual) if rotation else "",

@@ -13,7 +13,7 @@ import math
 from collections.abc import Generator, Sequence
 from itertools import compress
 from operator import mul
-from typing import Final, Literal, TypeAlias
+from typing import Final
 
 import msgspec
 import numpy as np
@@ -57,19 +57,8 @@ _STILL: Final = 1e-7
 """Change of all joints below which a search has converged, rad or m."""
 _DAMPING: Final = (1e-3, 1e-7, 1e-12)
 """First damping, that of a start near the solution, and smallest: parts of the squared length."""
-Orientation: TypeAlias = Literal["exact", "nearest"]
 FULL: Final = 6
 """Degrees of freedom of a pose. Fewer joints lack orientations, and more leave a choice."""
-
-
-def demands_orientation(orientation: Orientation | None, joints: int) -> bool:
-    """Return True if a pose is not reached without its orientation.
-
-    Args:
-        orientation: Parameter `orientation` of the arm's controller; None: not given.
-        joints: Number of the arm's joints.
-    """
-    return orientation == "exact" or (orientation is None and joints >= FULL)
 
 
 class Residual(msgspec.Struct, frozen=True):

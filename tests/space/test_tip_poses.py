@@ -9,7 +9,7 @@ import pytest
 from tests.kit.commands import Dxlrun
 from tests.kit.judged_arms import Arm, example, turn
 
-from dxlrun import DxlrunError, Refused, RemoteRobot
+from dxlrun import DxlrunError, InputError, Refused, RemoteRobot
 from dxlrun.compile.robot_compiler import compile_files
 from dxlrun.testing import plan_of
 from dxlrun.tooling.runs import VirtualLink
@@ -63,6 +63,31 @@ SECTION = {
     "open_manipulator_x_space": {"above": (20, 0, 15, 0, 60, 0), "at_cube": (20, 0, 6, 0, 60, 0)},
 }
 """Poses of the robot files, cm and deg."""
+
+
+def test_six_joints_refuse_a_missed_orientation_only_if_exact(tmp_path: Path) -> None:
+    file = tmp_path / "six.yaml"
+    joints = "[m1, m2, m3, m4, m5, m6]"
+
+    def compiled(orientation: str) -> Any:
+        file.write_text(
+            f"include: [{ROBOTS}/poppy_ergo_jr.yaml]\nname: six\n"
+            f"controllers: {{arm: {{active: false}}, hand: {{type: cartesian_controller, joints: {joints}, "
+            f"tip: tip{orientation}}}}}\n"
+            "poses: {turned: {tip: tip, x: 0 cm, y: -10 cm, z: 15 cm, rpy: [0 deg, 0 deg, 90 deg]}}\n"
+        )
+        return compile_files(file, {}, [])
+
+    solved = compiled(", orientation: nearest").plan.poses["turned"]
+    arm = example("poppy_ergo_jr", "base_link", "tip", *solved.positions)
+    place = arm.matrix([*solved.positions.values()])[:3, 3]
+    assert place == pytest.approx([0, -0.1, 0.15], abs=1e-4)
+    assert solved.remark.endswith("deg from the orientation, which the arm cannot reach")
+    for orientation in ("", ", orientation: exact"):
+        with pytest.raises(
+            InputError, match=r"3:.* hand refuses pose turned: it is .* deg from the orientat"
+        ):
+            compiled(orientation)
 
 
 def robot_of(name: str, kind: type[RemoteRobot] = RemoteRobot) -> Any:
