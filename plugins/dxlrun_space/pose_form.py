@@ -101,6 +101,8 @@ def _solve(pose: TipPose, urdf: str | None, joints: Mapping[str, tuple[float, fl
     for joint in pose.near:
         if joint not in chain.joints:
             raise WrongChain("near", f"{joint} does not move {pose.tip}", f"write {', '.join(chain.joints)}")
+    if lacking := next((joint for joint in chain.joints if joint not in joints), ""):
+        return SolvedPose({}, lacking=lacking)
     lower, upper = zip(*(joints[joint] for joint in chain.joints), strict=True)
     near = [pose.near.get(joint) for joint in chain.joints]
     solver = Solver(chain, lower, upper, near)

@@ -38,12 +38,12 @@ def draw_reach(robot: RobotPath, tip: str, picture: Path, /, *assignments: Assig
     limits = {joint.name: (joint.lower, joint.upper) for joint in plan.loop.joints}
     try:
         chain = chain_of(plan.urdf, base, tip)
-        lower, upper = zip(*(limits[joint] for joint in chain.joints), strict=True)
     except WrongChain as wrong:
         raise InputError(str(wrong)) from None
-    except KeyError as error:
+    if lacking := next((joint for joint in chain.joints if joint not in limits), ""):
         fix = "run with it, or add it to `joints`"
-        raise InputError(f"{tip} needs {error.args[0]}, which is omitted or has no servo; {fix}") from None
+        raise InputError(f"{tip} needs {lacking}, which is omitted or has no servo; {fix}")
+    lower, upper = zip(*(limits[joint] for joint in chain.joints), strict=True)
     places, found = dexterity(chain, spread(lower, upper, POSTURES).tolist())
     places *= 1e3
     write_target(picture, _drawn(places, found, f"{tip} of {plan.robot}", picture.suffix[1:]))

@@ -174,6 +174,8 @@ class SolvedPose(msgspec.Struct, frozen=True):
     """Part of the pose that the joints do not reach; empty: none."""
     figures: Mapping[str, float] = {}
     """Figures for `dxlrun check`, by the heading of their column."""
+    lacking: str = ""
+    """Joint that the pose needs, and that the run does not have; empty: none."""
 
 
 class PoseStage(msgspec.Struct, Generic[T], frozen=True):
@@ -189,8 +191,7 @@ class PoseStage(msgspec.Struct, Generic[T], frozen=True):
     form: type[T]
     solve: Callable[[T, str | None, Mapping[str, tuple[float, float]]], SolvedPose]
     """Returns the joints for a pose, the text of the URDF, and the limits of all joints of the run, rad or m.
-    Raises KeyError with the name of a joint that the run lacks, or `Mistakes` with keys of the pose and texts
-    `problem; fix`."""
+    The answer may name a lacking joint. Raises `Mistakes` with keys of the pose and texts `problem; fix`."""
 
 
 class Feature(msgspec.Struct, frozen=True):

@@ -80,16 +80,17 @@ class Poses(msgspec.Struct, frozen=True):
         """Return a pose in the form of a feature; raise WrongPose as `find_pose`."""
         if self.has_mistakes:
             raise WrongPose
-        solve = next(one.solve for one in pose_stages() if isinstance(pose, one.form))
+        stage = next(one for one in pose_stages() if isinstance(pose, one.form))
         limits = {name: (joint.lower, joint.upper) for name, joint in self.joints.items()}
         try:
-            return solve(pose, self.urdf, limits)
-        except KeyError as error:
-            joint = str(error.args[0])
-            what = f"the pose needs {joint}, which is omitted or has no servo"
-            raise WrongPose(((), what, f"run with {joint}, or add it to `joints`"), lacking=joint) from None
+            solved = stage.solve(pose, self.urdf, limits)
         except Mistakes as error:
             raise WrongPose(*((path, *what_and_fix(text)) for path, text in error.found)) from None
+        if joint := solved.lacking:
+            what = f"the pose needs {joint}, which is omitted or has no servo"
+            fix = f"run with {joint}, or add it to `joints`"
+            raise WrongPose(((stage.name,), what, fix), lacking=joint)
+        return solved
 
     def find_named(self, name: str) -> SolvedPose:
         """Return the pose with a name; raise WrongPose as `find_pose`."""
