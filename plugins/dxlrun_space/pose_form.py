@@ -28,21 +28,21 @@ def at_most_a_turn(value: float) -> float:
     return value
 
 
-def check_turns(quaternion: tuple[float, ...] | None, *others: tuple[float, ...] | None) -> None:
-    """Raise ValueError for more than one orientation, or a quaternion that is not of length 1."""
-    if sum(each is not None for each in (quaternion, *others)) > 1:
-        raise ValueError("several orientations are given; keep one")
-    if quaternion is not None and abs(math.hypot(*quaternion) - 1) > NORM:
-        raise ValueError(f"the quaternion has length {math.hypot(*quaternion):.4g}; scale it to length 1")
-
-
 def rotation_of(
-    quaternion: tuple[float, float, float, float] | None, rpy: tuple[float, float, float] | None
+    quaternion: tuple[float, float, float, float] | None, *turns: tuple[float, float, float] | None
 ) -> tuple[float, float, float, float] | None:
-    """Return an orientation as a quaternion of length 1; None: none is given."""
+    """Return the given orientation as a quaternion of length 1, or None.
+
+    Raises ValueError for more than one orientation, or a quaternion that is not of length 1.
+    """
+    given = [each for each in turns if each is not None]
+    if len(given) + (quaternion is not None) > 1:
+        raise ValueError("several orientations are given; keep one")
     if quaternion is None:
-        return None if rpy is None else from_rpy(rpy)
+        return from_rpy(given[0]) if given else None
     length, (x, y, z, w) = math.hypot(*quaternion), quaternion
+    if abs(length - 1) > NORM:
+        raise ValueError(f"the quaternion has length {length:.4g}; scale it to length 1")
     return x / length, y / length, z / length, w / length
 
 
@@ -73,7 +73,7 @@ class TipPose(Form):
 
     @model_validator(mode="after")
     def _has_one_orientation(self) -> Self:
-        check_turns(self.quaternion, self.rpy)
+        rotation_of(self.quaternion, self.rpy)
         return self
 
 

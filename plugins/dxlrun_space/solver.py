@@ -43,8 +43,6 @@ _FAILING: Final = 0.8
 """A start is given up when two steps together do not reduce the cost to this fraction."""
 _STALLING: Final = 1 - 1e-6
 """Ratio of two costs beyond which the nearest pose is found: the rest of its distance is 0.1 mm in 1 m."""
-_POSTURE: Final = 1e-5
-"""Lever of the distance from the posture."""
 _PULL: Final = 0.02
 """Lever of the posture of an arm with more joints than a pose needs."""
 _FINE: Final = 0.05
@@ -55,7 +53,7 @@ _LONGEST_STEP: Final = 1.0
 """Largest change of a joint in a step, rad or m: the linear model is not valid for more."""
 _STILL: Final = 1e-7
 """Change of all joints below which a search has converged, rad or m."""
-_DAMPING: Final = (1e-3, 1e-7, 1e-12)
+_DAMPING: Final = (1e-3, 1e-7, 1e-10)
 """First damping, that of a start near the solution, and smallest: parts of the squared length."""
 FULL: Final = 6
 """Degrees of freedom of a pose. Fewer joints lack orientations, and more leave a choice."""
@@ -206,13 +204,14 @@ class Solver:
         """
         lever = EXACT if exact else NEAREST
         if self._redundant:
-            # First a strong pull, which moves the tip by 0.1 mm, then the pose from there.
-            pulled = yield from self._descend(target, start, lever, steps, leash, pull=_PULL)
-            start, leash = pulled.positions, 0.0
-        found = yield from self._descend(target, start, lever, steps, leash)
+            # First toward the posture, which moves the tip by 0.1 mm, then the pose from there.
+            pairs = zip(self._inside(start), self._posture, strict=True)
+            near = [a if b is None else min(max(b, a - leash), a + leash) for a, b in pairs]
+            start = (yield from self._descend(target, start, lever, steps, near)).positions
+        found = yield from self._descend(target, start, lever, steps)
         if not exact and not found.residual.suffices(exact=False):
             # Near a singularity even the small lever of the orientation moves the position.
-            found = yield from self._descend(target, found.positions, 0.0, steps, leash)
+            found = yield from self._descend(target, found.positions, 0.0, steps)
         return found
 
     def _descend(
@@ -221,25 +220,20 @@ class Solver:
         start: Sequence[float],
         lever: float,
         steps: int = STEPS,
-        leash: float = math.inf,
+        posture: Sequence[float] | None = None,
         *,
         is_patient: bool = True,
-        pull: float = _POSTURE,
     ) -> Search:
         scale = self.chain.length
-        lever, tendency = lever * scale, (pull * scale) ** 2
+        lever, tendency = lever * scale, 0.0 if posture is None else (_PULL * scale) ** 2
         first, near, least = (each * scale * scale for each in _DAMPING)
         damping = near if is_patient else first
         now = self._inside(start)
-        posture = [
-            a if b is None else min(max(b, a - leash), a + leash)
-            for a, b in zip(now, self._posture, strict=True)
-        ]
+        posture = posture or now
         best = self._estimate(target, now, posture, lever, tendency)
         before = last = math.inf
         for _ in range(steps):
-            is_strong = 0.0 < lever * lever * 1e-3 <= tendency  # The posture still moves the joints.
-            if best.residual.suffices(lever > 0, _FINE) and not is_strong:
+            if not tendency and best.residual.suffices(lever > 0, _FINE):
                 break
             change = self._step(best, damping + tendency)
             trial = self._inside([a + b for a, b in zip(best.positions, change, strict=True)])

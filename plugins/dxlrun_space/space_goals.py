@@ -12,7 +12,7 @@ from pydantic import BeforeValidator, Field, TypeAdapter, model_validator
 from dxlrun import Angle, AngularVelocity, CommandModel, Floats, GoalPose, Length, LinearVelocity
 from dxlrun.tooling.robots import Transform, product
 from dxlrun_space.chain import Quaternion, Vector
-from dxlrun_space.pose_form import at_most_a_turn, check_turns, rotation_of
+from dxlrun_space.pose_form import at_most_a_turn, rotation_of
 
 S = TypeVar("S", bound=msgspec.Struct)
 
@@ -124,7 +124,7 @@ class PoseCommand(CommandModel):
             return self
         if not given:
             raise ValueError("the pose is empty; give a coordinate or an orientation, for example dz=5cm")
-        check_turns(self.quaternion, self.rpy, self.drpy)
+        rotation_of(self.quaternion, self.rpy, self.drpy)
         return self
 
     def prepared(self, joints: Sequence[str]) -> TipGoal:
@@ -135,7 +135,7 @@ class PoseCommand(CommandModel):
         return TipGoal(
             place=(self.x, self.y, self.z),
             way=(self.dx or 0.0, self.dy or 0.0, self.dz or 0.0),
-            rotation=rotation_of(self.quaternion, self.rpy or self.drpy),
+            rotation=rotation_of(self.quaternion, self.rpy, self.drpy),
             is_turn=self.drpy is not None,
             frame=self.frame,
             path=self.path,
