@@ -168,7 +168,9 @@ class Solver:
                 if best.residual.position > max(CLOSE_M, place.residual.position):
                     best = yield from self.search_from(target, place.positions, exact=False)
         if self._redundant:
-            best = yield from self.search_from(target, best.positions, exact=True, leash=math.inf)
+            posed = yield from self.search_from(target, best.positions, exact=True, leash=math.inf)
+            # The way to the posture may end where the pose cannot be reached.
+            best = posed if posed.residual.suffices(exact=True) else best
         return best
 
     def search_place(self, target: Transform, start: Sequence[float]) -> Search:
