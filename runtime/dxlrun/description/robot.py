@@ -362,7 +362,7 @@ def pose_form() -> object:
     """Return the pydantic type of a pose: positions by joint, or the form of a feature.
 
     A pose in the form of a feature has a text that is not a quantity: with the feature's key or a foreign
-    term for it, or next to another key of the form; or it has all keys that the form requires.
+    term for it, or next to another key of the form; or all required keys, and no text at the feature's.
     """
     forms = pose_stages()
 
@@ -372,7 +372,8 @@ def pose_form() -> object:
         for one in forms:
             keys, named = one.form.model_fields.keys(), {one.name, *words_for(one.form.__name__, [one.name])}
             needed = {key for key, field in one.form.model_fields.items() if field.is_required()}
-            if texts & named or (texts - keys and values.keys() & keys) or needed <= values.keys():
+            is_whole = needed <= values.keys() and not isinstance(values.get(one.name, ""), str)
+            if texts & named or (texts - keys and values.keys() & keys) or is_whole:
                 return f"<{one.name}>"
         return "<joints>"
 
