@@ -210,7 +210,7 @@ def tooling_page(name: str) -> str:
     rows = ["| name | |", "|---|---|"]
     for own in sorted(page.__all__, key=str.lower):
         thing = getattr(page, own)
-        documented = inspect.isclass(thing) or inspect.isroutine(thing)
+        documented = inspect.isclass(thing) or inspect.isroutine(thing) or inspect.ismodule(thing)
         about = (inspect.getdoc(thing) or "").partition("\n\n")[0] if documented else ""
         rows.append(f"| `{own}` | {' '.join(about.split())} |")
     return "\n\n".join([f"### `dxlrun.tooling.{name}`", inspect.getdoc(page) or "", "\n".join(rows)])
