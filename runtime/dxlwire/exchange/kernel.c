@@ -827,10 +827,8 @@ static int32_t goal_tick(const Cell *c, double goal, double ceiling)
 static int32_t stuff(uint8_t *packet, int32_t size)
 {
     for (int32_t at = 10; at < size; at++)
-        if (packet[at] == 0xfd && packet[at - 1] == 0xff && packet[at - 2] == 0xff) {
+        if (packet[at] == 0xfd && packet[at - 1] == 0xff && packet[at - 2] == 0xff)
             memmove(packet + at + 1, packet + at, (size_t)(size++ - at));
-            at++;
-        }
     return size;
 }
 
@@ -870,16 +868,18 @@ static int32_t build(Kernel *k, const Line *l, SyncWrite *w, uint8_t *packet)
     if (size == head)
         return 0;
     if (l->protocol == 1) {
+        const uint8_t start[] = {0xff, 0xff, 0xfe, (uint8_t)(size - 3), 0x83,
+                                 (uint8_t)w->address, (uint8_t)w->length};
+        memcpy(packet, start, sizeof start);
         uint8_t sum = 0;
-        const uint8_t start[7] = {0xff, 0xff, 0xfe, (uint8_t)(size - 3), 0x83, (uint8_t)w->address, (uint8_t)w->length};
-        memcpy(packet, start, 7);
         for (int32_t i = 2; i < size; i++)
             sum = (uint8_t)(sum + packet[i]);
         packet[size++] = (uint8_t)~sum;
     } else {
-        const uint16_t place[2] = {(uint16_t)w->address, (uint16_t)w->length};
-        memcpy(packet, (const uint8_t[]){0xff, 0xff, 0xfd, 0, 0xfe, 0, 0, 0x83}, 8);
-        memcpy(packet + 8, place, 4);
+        const uint8_t start[] = {0xff, 0xff, 0xfd, 0, 0xfe, 0, 0, 0x83,
+                                 (uint8_t)w->address, (uint8_t)(w->address >> 8),
+                                 (uint8_t)w->length, (uint8_t)(w->length >> 8)};
+        memcpy(packet, start, sizeof start);
         size = stuff(packet, size);
         packet[5] = (uint8_t)(size - 5);
         packet[6] = (uint8_t)((size - 5) >> 8);
