@@ -66,9 +66,9 @@ class JointStates:
     def add_states(self, log: Log) -> None:
         """Keep samples of the joint states in the next slice of the log."""
         cycles = log.cycles
-        cycles = cycles[cycles["cycle"] % _cycles_per_sample(cycles["period_ns"]) == 0]
         if not len(cycles):
             return
+        cycles = cycles[cycles["cycle"] % _cycles_per_sample(cycles["period_ns"]) == 0]
         angle = np.where(cycles["valid"], cycles["position"] / self.share, np.nan)
         usable = _USABLE[cycles["torque"]]
         self._held.append((cycles["cycle"], cycles["period_ns"], angle, cycles["temperature"], usable))
