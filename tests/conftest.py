@@ -25,6 +25,8 @@ settings.register_profile("search", derandomize=False, print_blob=True, max_exam
 settings.load_profile("fixed")
 # each process that a test starts would compile all that it imports: a run takes 4 s of a processor, not 1.5 s
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+# with two threads for each process numpy waits for cores that others have, at 70 times the processor time
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 gc.set_threshold(50_000, 20, 20)  # as in `dxlrun`: the many tests that are collected are no garbage
 
 

@@ -36,6 +36,14 @@ def test_every_test_has_a_limit(pytestconfig: pytest.Config) -> None:
     assert 0 < float(pytestconfig.getini("timeout")) <= 120
 
 
+def test_numpy_computes_in_one_thread() -> None:
+    code = "import numpy, os; print(len(os.listdir('/proc/self/task')))"
+    assert (
+        subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+        == "1\n"
+    )
+
+
 def test_limit_grows_with_the_load(pytestconfig: pytest.Config, monkeypatch: pytest.MonkeyPatch) -> None:
     """A page is drawn without a graphics processor for 110 s beside 23 programs on two cores."""
     given: list[float] = []
