@@ -19,6 +19,7 @@ from tests.kit.answers import read_answer, result_of
 from tests.kit.awaited import DEADLINE_S, until
 from tests.kit.hands import Screen, plain
 from tests.kit.pages import page_blocks, page_text
+from tests.kit.torso import copy_robots
 
 from dxlsim.bus.ledger import read_ledger
 
@@ -119,7 +120,9 @@ def hear(path: Path | str, ask: bytes, size: int) -> bytes:
         os.close(port)
 
 
-def test_robot_runs_against_it_as_against_a_real_one(start: Start, torso: Path, tmp_path: Path) -> None:
+def test_robot_runs_against_it_as_against_a_real_one(start: Start, tmp_path: Path) -> None:
+    copy_robots(tmp_path)
+    torso = tmp_path / "robots/bioloid_torso.yaml"
     sim = start(torso, "--link", "torso", "--ledger", "ledger.jsonl")
     assert sim.line() == (
         "bioloid_torso: 8 servos simulated on 1 bus; Ctrl-C ends it, `help` lists faults to type"
@@ -129,7 +132,7 @@ def test_robot_runs_against_it_as_against_a_real_one(start: Start, torso: Path, 
     assert sim.line().startswith("  in real time: ")
     hint = sim.line()
     assert hint == f"next: dxlrun {torso} port:={tmp_path / 'torso'}"
-    command = [*PROGRAM, *hint.split()[2:], "rate:=20", "--duration", "0.5", "--no-record"]
+    command = [*PROGRAM, *hint.split()[2:], "rate:=5", "--duration", "0.5", "--no-record"]
     ran = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
     assert ran.returncode == 0, ran.stdout + ran.stderr
     assert "bioloid_torso: " in ran.stdout
