@@ -159,14 +159,15 @@ RULES: Mapping[str, Rule] = {
     "oscillates": Rule(
         "joint, or the controller if its goals swing",
         "swings around its trajectory that the trajectory does not have",
-        "2 deg, six times a second for a second",
+        "2 deg, six times a second for a second; or ten even swings of 0.6 deg in a row",
         "Lower the gains of servo and controller; look for play in gears and horn.",
         _JOINT,
     ),
     "follows_worse": Rule(
         "joint",
-        "its error, compared with its earlier error at the same goals",
-        "9 deg for a second; or 4.6 deg and three times the earlier error",
+        "error, lag and load compared with earlier values, at the same places and in the same direction",
+        "9 deg of error for a second; or 4.6 deg and three times the earlier error; or a change by 2 deg or "
+        "an eighth of the torque, three times the change of any other joint",
         "Turn it by hand without torque, and compare gains and limits with the robot file "
         "(`dxlrun servo {port} {servo_id} get`).",
         _JOINT,

@@ -1,4 +1,4 @@
-"""Joints that do not do what they are told, and joints that only look so."""
+"""Joints that do not do what they are told or follow otherwise than before, and joints that only look so."""
 
 import math
 from collections.abc import Sequence
@@ -12,9 +12,11 @@ import pytest
 from dxlrun.channels.cycle import Torque
 from dxlrun.plan.loop_plan import JointPlan
 from dxlrun_analysis.finding import Finding, Rank
+from dxlrun_analysis.joints.following import followed
 from dxlrun_analysis.joints.joint_columns import JointColumns
 from dxlrun_analysis.joints.movement import Movement
 from dxlrun_analysis.joints.planned import PlannedJoint
+from dxlrun_analysis.joints.trail import STEP_S, Trail
 
 Floats = npt.NDArray[np.float64]
 DT = 0.02
@@ -154,7 +156,7 @@ def shaking(swing: float, hertz: float) -> Floats:
 
 @pytest.mark.parametrize(
     ("swing", "hertz", "rank"),
-    [(0.04, 10.0, Rank.SERVO), (0.04, 4.0, None), (0.015, 10.0, None)],
+    [(0.04, 10.0, Rank.SERVO), (0.04, 4.0, Rank.REMARK), (0.015, 5.0, Rank.REMARK), (0.005, 5.0, None)],
 )
 def test_joint_that_swings_around_its_goal_oscillates(swing, hertz, rank):
     shakes = shaking(swing, hertz)
@@ -267,3 +269,138 @@ def test_thresholds_of_a_linear_joint_are_those_of_its_servo(position, codes):
     linear = {"share": 0.01, "tick": TICK * 0.01}
     joint = Joint(way=SWING * 0.01, position=position * 0.01, planned=linear)
     assert [one.code for one in findings(joint)] == codes
+
+
+# Joints that follow, but otherwise than they did at the same places
+
+WAYS = np.sign(np.gradient(SWING, TIME))
+FRICTION = 0.05 * WAYS
+PEER = Joint(position=behind(SWING), load=FRICTION)
+
+
+def beside_peers(position: Floats, load: Any = FRICTION) -> list[Any]:
+    return findings(Joint(position=position, load=load), PEER, PEER)
+
+
+def slack(half: float) -> Floats:
+    """A position that stands still at each turn until its motor is through the play."""
+    way, moved = behind(SWING), []
+    at = float(way[0])
+    for value, now in zip(way, FAULT, strict=True):
+        play = half if now else 0.0
+        at = min(max(at, value - play), value + play)
+        moved.append(at)
+    return np.array(moved)
+
+
+FAR = np.maximum(SWING - 0.2, 0.0)
+RUBS = since_fault(0.4, 0.05) * WAYS
+WEIGHT = 0.4 + FRICTION
+LOOSE = slack(0.05)
+PULLED = behind(SWING) - since_fault(0.12 * FAR, 0.0)
+ONE_STROKE = np.where((TIME > 9.0) & (TIME < 9.4), 0.12 * FAR, 0.0)
+
+CHANGED = {
+    "play": (LOOSE, FRICTION, "upwards -2.8 deg off instead of -0.1"),
+    "each way by itself": (LOOSE, FRICTION, "downwards 2.9 deg off instead of 0.1, with 1% of its torque"),
+    "load not read": (LOOSE, math.nan, "-2.8 deg off instead of -0.1; downwards"),
+    "friction": (LOOSE, RUBS, "at rest -2.8 deg off instead of 0.0, with 40%"),
+    "later": (since_fault(behind(SWING, 5)), FRICTION, "-8.3 deg"),
+    "pulled": (PULLED, since_fault(0.5 * FAR, 0.0) + FRICTION, "24% of its torque instead"),
+    "off everywhere": (behind(SWING) - 0.06 * FAULT, FRICTION, "-3.4 deg"),
+}
+"""Joints that follow otherwise than at first, and words of what is said of them."""
+LOADED = {
+    "friction": RUBS,
+    "carries nothing": since_fault(FRICTION, WEIGHT),
+    "carries more": since_fault(WEIGHT, FRICTION),
+    "carries half": since_fault(WEIGHT - 0.2, WEIGHT),
+}
+"""Loads of joints that follow as before, with another torque at the same places."""
+SAME = {
+    "half a degree": (slack(0.01), FRICTION),
+    "a little friction": (behind(SWING), since_fault(0.12, 0.05) * WAYS),
+    "always late": (behind(SWING, 4), FRICTION),
+    "a little spring": (behind(SWING) - since_fault(0.05 * FAR, 0.0), FRICTION),
+    "a weight": (behind(SWING) - 0.15 * np.cos(behind(SWING)), FRICTION),
+    "a hanging weight": (behind(SWING) - 0.15 * np.sin(behind(SWING)), FRICTION),
+    "a weight for one stroke": (behind(SWING) - ONE_STROKE, FRICTION),
+    "load at its ends": (behind(SWING), since_fault(0.4 * (SWING / 0.8) ** 8, 0.0)),
+    "load as ever": (behind(SWING), WEIGHT),
+    "replies are missing": (np.where(np.arange(600) % 20, behind(SWING) - 0.06 * FAULT, math.nan), FRICTION),
+}
+
+
+@pytest.mark.parametrize("case", CHANGED)
+def test_joint_that_follows_otherwise_at_the_same_places_is_named_with_its_numbers(case):
+    position, load, words = CHANGED[case]
+    (one,) = beside_peers(position, load)
+    assert (one.code, one.subject, one.rank) == ("follows_worse", "j0", Rank.CAUSE)
+    assert "follows differently than before at the same places" in one.sentence
+    assert words in one.sentence
+    assert "starting at 5." in one.sentence
+
+
+@pytest.mark.parametrize("case", LOADED)
+def test_another_load_at_the_same_places_is_a_remark(case):
+    (one,) = beside_peers(behind(SWING), LOADED[case])
+    assert (one.code, one.subject, one.rank) == ("follows_worse", "j0", Rank.REMARK)
+    assert findings(Joint(load=LOADED[case]), Joint(load=LOADED[case]), PEER) == []
+
+
+@pytest.mark.parametrize("case", SAME)
+def test_joint_that_follows_as_its_load_lets_it_is_not_named(case):
+    assert beside_peers(*SAME[case]) == []
+
+
+def test_what_several_joints_show_accuses_none_of_few_and_no_mirror_images():
+    loose, looser = (Joint(position=slack(half), load=FRICTION) for half in (0.05, 0.07))
+    assert findings(loose, loose, PEER) == []
+    assert [one.subject for one in findings(loose, looser, PEER, PEER, PEER)] == ["j0", "j1"]
+    assert findings(loose, loose, loose, PEER, PEER) == []
+    assert findings(loose, looser, PEER, PEER) == []  # of few others the worst counts
+    names = ("left_knee", "right_knee", "neck", "left_hip", "right_hip")
+    assert findings(loose, looser, PEER, PEER, PEER, names=names) == []
+
+
+def test_joint_that_had_no_torque_is_judged_once_it_is_on_its_way_again():
+    way = 0.3 * np.sin(3.5 * TIME)
+    position = np.where(TIME < 5.0, way, way + 0.3 * np.exp(-np.maximum(TIME - 7.0, 0.0) / 1.5))
+    torque = np.where((TIME > 5.0) & (TIME < 7.0), 0, Torque.ON)
+    found = findings(Joint(way, position, 0.05, torque), PEER, PEER)
+    assert "follows_worse" not in {one.code for one in found}
+
+
+# What is kept of a run
+
+
+def test_long_run_keeps_its_begin_and_its_end():
+    trail, cycles = Trail(1, 0), 30_000
+    at_ns = (np.arange(cycles) * 0.03e9).astype(np.int64)
+    column = np.arange(cycles, dtype=np.float64)[:, None]
+    for begin in range(0, cycles, 999):
+        part = slice(begin, begin + 999)
+        trail.add_cycles(at_ns[part], column[part], column[part], column[part])
+    kept = trail.samples()
+    assert len(kept.at_s) == 8_192
+    assert kept.way[:4096, 0].tolist() == list(range(4096))
+    assert np.isnan(kept.way[4096, 0])
+    assert kept.way[4097:, 0].tolist() == list(range(cycles - 4095, cycles))
+
+
+def test_of_many_cycles_one_is_kept_each_20_ms():
+    trail, values = Trail(1, 10**9), np.zeros((1000, 1))
+    at_ns = 10**9 + np.arange(1000) * 1_000_000
+    for part in (slice(0, 333), slice(333, 1000)):
+        trail.add_cycles(at_ns[part], values[part], values[part], values[part])
+    assert np.diff(trail.samples().at_s) == pytest.approx(STEP_S)
+
+
+def test_joint_is_compared_with_the_lag_of_its_kind():
+    trail, way = Trail(3, 0), np.tile(SWING[:, None], 3)
+    position = np.column_stack([behind(SWING, cycles) for cycles in (2, 2, 5)])
+    trail.add_cycles((TIME * 1e9).astype(np.int64), way, position, np.zeros_like(way))
+    planned = [PlannedJoint(f"j{row}", tick=TICK, top_effort=1.0) for row in range(3)]
+    assert [one.lag_s for one in followed(planned, trail.samples())] == pytest.approx([0.04] * 3)
+    other = [*planned[:2], PlannedJoint("j2", tick=TICK, top_effort=1.0, alike="MX")]
+    assert [one.lag_s for one in followed(other, trail.samples())] == pytest.approx([0.04, 0.04, 0.1])

@@ -50,6 +50,7 @@ typedef struct { /* shape (quantities, bins, joints) */
 typedef struct { /* overwritten; cycles without the known ones */
     double *values;            /* shape (quantities, cycles) */
     double *off, *led, *marks; /* shape (cycles,) */
+    double *free;              /* position with torque and position control, shape (joints, cycles) */
 } Scratch;
 
 uint32_t dxl_source(void)
@@ -167,7 +168,7 @@ void movement_add(
             values[POSITION][at] = unknown ? NAN : free, values[SPEED][at] = unknown ? NAN : speed;
             values[LOAD][at] = unknown ? NAN : fabs(cycles->effort[row + at]);
             values[AWAY][at] = hurries ? 0.0 : fabs(error);
-            scratch->off[at] = error, scratch->led[at] = way[at];
+            scratch->free[joint * count + at] = free, scratch->off[at] = error, scratch->led[at] = way[at];
             if (unknown) {
                 /* A joint that a controller moves with an effort has no reachable trajectory. */
                 int64_t column = moves && by_effort ? joints->reference[joint] : -1;

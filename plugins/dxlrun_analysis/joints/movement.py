@@ -1,6 +1,6 @@
 """Movement of the joints over a run, and findings about joints that failed to follow their commands.
 
-The rules are in failing.py, with one exception: two positions within half a second, with
+The rules are in failing.py and following.py, with one exception: two positions within half a second, with
 torque throughout, are a *jump* if they are 9 deg and a quarter further apart than the model can turn in that
 time.
 """
@@ -33,8 +33,10 @@ from dxlrun_analysis.joints.failing import (
     failure_of,
     joint_finding,
 )
+from dxlrun_analysis.joints.following import changed, followed
 from dxlrun_analysis.joints.joint_columns import JointColumns
 from dxlrun_analysis.joints.planned import PlannedJoint
+from dxlrun_analysis.joints.trail import Trail
 
 _NONE: Mapping[str, float] = {}
 _FIELDS = (
@@ -91,6 +93,7 @@ class Movement:
         }
         self._jumps = _Jumps.of_joints(len(joints))
         self.bins = Bins(_QUANTITIES, len(joints), begin_ns)
+        self._trail = Trail(len(joints), begin_ns)
 
     def add_cycles(self, columns: JointColumns, way: Floats, known: int) -> None:
         """Add the cycles from number `known` on; the first `known` were already added, and are used for
@@ -106,11 +109,12 @@ class Movement:
             return
         way = np.ascontiguousarray(way)
         rate = 1e9 / max(float(np.median(np.diff(read_ns[known:]))), 1.0) if count > 2 else 0.0
-        values, (off, led, marks) = np.empty((_QUANTITIES, count)), np.empty((3, count))
+        values, free = np.empty((_QUANTITIES, count)), np.empty((len(way), count))
+        off, led, marks = np.empty((3, count))
         used = {name: columns[name] for name in _FIELDS}
         times = {"read_ns": read_ns, "bin": self.bins.find_bins(read_ns[known:]), "steps": columns.steps}
         numbers = {"count": len(columns), "known": known, "torque_on": int(Torque.ON)}
-        scratch = {"values": values, "off": off, "led": led, "marks": marks}
+        scratch = {"values": values, "off": off, "led": led, "marks": marks, "free": free}
         structures = (
             _structure("Cycles", used | times | {"way": way}, rate=rate, **numbers),
             _structure("Joints", self._settings, count=len(way)),
@@ -119,6 +123,7 @@ class Movement:
             _structure("Scratch", scratch),
         )
         _library().movement_add(*map(ctypes.byref, structures))
+        self._trail.add_cycles(read_ns[known:], way[:, known:].T, free.T, columns["effort"][:, known:].T)
 
     def findings(self, reached_off: Mapping[str, float] = _NONE) -> Iterable[Finding]:
         """Report joints that stand still, oscillate, or follow worse than before, and positions that jumped.
@@ -134,9 +139,12 @@ class Movement:
         shared = sum(failing is not None and failing.shared for _, failing in found)
         # The cause is then the line, the supply, the load or the motion.
         together = shared > max(1, len(found) // 2)
+        named: set[int] = set()
         for row, (one, failing) in enumerate(found):
             if self._jumps.number[row]:
                 yield self._jumps.finding(row, one.joint, self.bins.begin_ns)
+            if self._jumps.number[row] or failing is not None:
+                named.add(row)
             if failing is None or (failing.shared and together):
                 continue
             peers = [each for each in (short if one is short[row] else windows) if each is not one]
@@ -152,6 +160,8 @@ class Movement:
                 "is common, such as line, supply, load or motion.",
                 rank=Rank.SERVO,
             )
+        else:
+            yield from changed(followed(self._joints, self._trail.samples()), named)
 
     def _windows(self, seconds: float, allowed: Sequence[float]) -> list[Windows]:
         length_s, *values = self.bins.joined(seconds)

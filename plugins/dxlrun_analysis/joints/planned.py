@@ -44,6 +44,7 @@ class PlannedJoint:
     slowest: float = 0.0
     share: float = 1.0  # m of a linear joint per rad of its servo; 1 for a rotary joint
     softness: float = 1.0  # Ratio of the model's default gain to the gain in the robot file, 1 to 3
+    alike: str = ""  # Models and registers; joints with the same ones follow alike
     wraps: bool = False  # Its position jumps between the ends of its range once per turn (wheel mode)
     logged: JointPlan = UNKNOWN_JOINT
     errors: tuple[HardwareErrors, ...] = ()  # Error bits of its servos' models, without duplicates
@@ -85,6 +86,7 @@ def planned_joints(log: Log) -> tuple[PlannedJoint, ...]:
                 sum(one.share * one.servo.rad_s_per_tick for one in mine),
                 sum(one.share for one in mine) if joint.unit is LINEAR else 1.0,
                 max(_softness(one) for one in mine),
+                ", ".join(sorted(f"{one.servo.model} {one.servo.declared}" for one in mine)),
                 joint.continuous and any(_counts_one_turn(one) for one in mine),
                 joint,
                 tuple({one.servo.model: table.errors for one in mine if (table := _table(one))}.values()),
