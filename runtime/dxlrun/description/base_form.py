@@ -34,9 +34,10 @@ def validation_error(what: str, fix: str) -> PydanticCustomError:
 def _name(value: str) -> str:
     # Names become topics of the log and interfaces `<joint>/<interface>`.
     if not _NAME.fullmatch(value):
-        raise validation_error(
-            f"{value!r} is not a valid name", _name_fix(re.sub(r"\W+", "_", value.strip(), flags=re.ASCII))
-        )
+        fix = re.sub(r"(\w+) *[:=] *(-?\d.*)", r"write `\1: \2`", value, flags=re.ASCII)  # `elbow=9 deg`
+        if fix == value:
+            fix = _name_fix(re.sub(r"\W+", "_", value.strip(), flags=re.ASCII))
+        raise validation_error(f"{value!r} is not a valid name", fix)
     return value
 
 

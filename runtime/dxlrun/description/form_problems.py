@@ -9,12 +9,12 @@ from contextlib import suppress
 from types import UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
-from pydantic import BaseModel, Tag, ValidationError
+from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from dxlrun.description.base_form import Mistakes, PlugInEntry
 from dxlrun.description.document import KeyPath, Marks, PlainDocument, plain_value, text_of
-from dxlrun.description.mistakes.forms import example_at, keys_for
+from dxlrun.description.mistakes.forms import annotation_at, example_at, form_at, keys_for, without_none
 from dxlrun.description.mistakes.syntax import list_text
 from dxlrun.description.mistakes.words import SWITCHED_OFF, Remedy, UnknownKeyContext, yaml_text
 from dxlrun.description.units import bound_text, example_of, units_of
@@ -56,10 +56,20 @@ def problems_of(
         one = _Error(details, marks, prefix, model, beside)
         if one.meant and not any(one.path[:end] in unknown for end in range(len(one.path) + 1)):
             found.setdefault(one.path, []).append(one)
+    _join_lists(found)
     problems = [_merged(errors, marks) for errors in _explain_unknown_keys(found, marks, document)]
     # A list with two values too few has the same problem twice.
     problems = [*dict.fromkeys(problems)]
     return sorted(problems, key=lambda problem: problem.mark)
+
+
+def _join_lists(found: dict[KeyPath, list[_Error]]) -> None:
+    """Join each list without brackets, of which YAML took all items but the first for keys."""
+    for path, (first, *_) in [*found.items()]:
+        if _TYPES.get(first.kind) == "a list" and isinstance(first.input, str):
+            for other, errors in [*found.items()]:
+                if other[:-1] == path[:-1] and (errors[0].kind, errors[0].input) == ("extra_forbidden", None):
+                    first.input += f", {found.pop(other)[0].path[-1]}"
 
 
 def _explain_unknown_keys(
@@ -97,7 +107,7 @@ def _remedies_at(
     parent: KeyPath, unknown: Mapping[str, _Error], marks: Marks, document: type[BaseModel] | None
 ) -> list[Remedy]:
     first = next(iter(unknown.values()))
-    form = None if first.model is None else _follow(first.model, first.location[:-1])
+    form = None if first.model is None else form_at(first.model, first.location[:-1])
     if first.model is None or form is None:
         return []
     sections: dict[str, list[str]] = {}
@@ -208,7 +218,7 @@ def _repair(data: dict[str, object], error: _Error) -> KeyPath | None:
 
 
 def _has_default(error: _Error) -> bool:
-    owner = None if error.model is None else _follow(error.model, error.location[:-1])
+    owner = None if error.model is None else form_at(error.model, error.location[:-1])
     info = None if owner is None else owner.model_fields.get(str(error.location[-1]))
     return info is not None and not info.is_required()
 
@@ -299,9 +309,9 @@ class _Error:
         return path_text(self.path)
 
     @property
-    def example(self) -> str | None:
-        """Example of the key's value from its field; None if it has none."""
-        return None if self.model is None else _example_at(self.model, self.location)
+    def example(self) -> str:
+        """Example of the key's value from its field; empty if it has none."""
+        return "" if self.model is None else example_at(self.model, self.location)
 
     @property
     def units(self) -> Mapping[str, float]:
@@ -433,7 +443,7 @@ def _remedy(error: _Error, marks: Marks) -> str:
     if expected in ("a mapping", "a list") and (fix := _indentation(error) or _only_key(error, marks)):
         return fix
     if error.kind in ("literal_error", "enum"):
-        at = None if error.model is None else _without_none(_annotation_at(error.model, error.location))
+        at = None if error.model is None else without_none(annotation_at(error.model, error.location))
         options = (*get_args(at),) if get_origin(at) is Literal else ()
         return suggestion(
             str(error.input), [one for one in options if isinstance(one, str)], "write one of them"
@@ -473,7 +483,7 @@ def _items(text: str, error: _Error, marks: Marks) -> str:
     if re.fullmatch(r"\[.*\]", text):  # in quotes
         return text
     names = re.findall(r"[\w.]+", text)
-    at = None if error.model is None else _without_none(_annotation_at(error.model, (*error.location, 0)))
+    at = None if error.model is None else without_none(annotation_at(error.model, (*error.location, 0)))
     if at is not str or not re.fullmatch(r"[\w., ]+|\*", text):
         return ""
     if error.path[-1] == "joints" and text in ("all", "*"):
@@ -483,7 +493,7 @@ def _items(text: str, error: _Error, marks: Marks) -> str:
 
 def _only_key(error: _Error, marks: Marks) -> str:
     """Return the fix for a value without its key, if only one key can be meant: `loop: 50`; else empty."""
-    form = None if error.model is None else _follow(error.model, error.location)
+    form = None if error.model is None else form_at(error.model, error.location)
     if form is None or error.input is None:
         return ""
     takes = keys_for(form, error.input)
@@ -493,9 +503,7 @@ def _only_key(error: _Error, marks: Marks) -> str:
     else:
         meant = takes if isinstance(error.input, str | list) else []  # many keys take a number
     if len(meant) > 1:  # 1 is a direction by chance only
-        meant = [
-            name for name in meant if get_origin(_without_none(_annotation_at(form, (name,)))) is not Literal
-        ]
+        meant = [key for key in meant if get_origin(without_none(annotation_at(form, (key,)))) is not Literal]
     if len(meant) != 1:
         return ""
     keys = {meant[0]: yaml_text(error.input)}
@@ -512,7 +520,7 @@ def _is_key_of_entry(error: _Error) -> bool:
     """Return True if an entry's name is really a key of the entry, indented too little."""
     if _TYPES.get(error.kind) != "a mapping" or error.model is None or not error.path:
         return False
-    form = _follow(error.model, error.location)
+    form = form_at(error.model, error.location)
     return form is not None and error.path[-1] in form.model_fields
 
 
@@ -534,12 +542,12 @@ def _example(error: _Error) -> str:
     key = error.path[-1] if error.path else ""
     if error.input is False and key in SWITCHED_OFF:
         return SWITCHED_OFF[key]
-    example = error.example if isinstance(key, str) else None
-    if example is None and error.model is not None and error.path[1:] and error.location[1:]:
+    example = error.example if isinstance(key, str) else ""
+    if not example and error.model is not None and error.path[1:] and error.location[1:]:
         # An entry has no example of its own, but its section has one. The last step may be a union's member.
         steps = error.location[: -1 if error.location[-1] == error.path[-1] else -2]
-        key, example = error.path[-2], _example_at(error.model, steps)
-    return "" if example is None else f"write for example `{key}: {example}`"
+        key, example = error.path[-2], example_at(error.model, steps)
+    return f"write for example `{key}: {example}`" if example else ""
 
 
 def _sentence(error: _Error) -> tuple[str, str]:
@@ -620,13 +628,6 @@ _SENTENCES: Mapping[str, Callable[[_Error], tuple[str, str]]] = {
 }
 
 
-def _example_at(model: type[BaseModel], location: tuple[str | int, ...]) -> str | None:
-    """Return the example of the field at pydantic's location, as written in a file; None if it has none."""
-    owner = _follow(model, location[:-1]) if location else None
-    info = None if owner is None else owner.model_fields.get(str(location[-1]))
-    return str(info.examples[0]) if info is not None and info.examples else None
-
-
 def _keys_at(
     model: type[BaseModel], location: tuple[str | int, ...]
 ) -> tuple[tuple[str, ...], Mapping[str, str]]:
@@ -635,66 +636,19 @@ def _keys_at(
     A model can list expected keys that are not possible (`refused`), and keys that are removed before the
     model is validated (`read_before`).
     """
-    owner = _follow(model, location)
+    owner = form_at(model, location)
     if owner is None:
         return (), {}
     refused: Mapping[str, str] = getattr(owner, "refused", {})
     return (*owner.model_fields, *getattr(owner, "read_before", ())), refused
 
 
-def _follow(model: type[BaseModel], location: tuple[str | int, ...]) -> type[BaseModel] | None:
-    """Return the model at pydantic's location; None if there is another type."""
-    at = _without_none(_annotation_at(model, location))
-    return at if isinstance(at, type) and issubclass(at, BaseModel) else None
-
-
-def _annotation_at(model: type[BaseModel], location: tuple[str | int, ...]) -> object:
-    """Return the type, with metadata, of the value at pydantic's location."""
-    at: object = model
-    for step in location:
-        at = _inner(at, step)
-    return at
-
-
 def _notes_at(model: type[BaseModel], location: tuple[str | int, ...]) -> Iterator[object]:
     """Yield the metadata (such as a quantity) of the type of the value at pydantic's location."""
-    at = _annotation_at(model, location)
+    at = annotation_at(model, location)
     while get_origin(at) in (Annotated, Union, UnionType):
         if get_origin(at) is Annotated:
             at, *notes = get_args(at)
             yield from notes
         else:
             at = next(arm for arm in get_args(at) if arm is not type(None))
-
-
-def _inner(at: object, step: str | int) -> object:
-    at = _without_none(at)
-    if get_origin(at) in (Union, UnionType):
-        return next((arm for arm in get_args(at) if step in _names(arm)), None)
-    if isinstance(at, type) and issubclass(at, BaseModel):
-        info = at.model_fields.get(str(step))
-        if info is None:
-            return None
-        return Annotated[info.annotation, *info.metadata] if info.metadata else info.annotation
-    arguments = get_args(at)
-    if get_origin(at) is dict:
-        return arguments[1]
-    return arguments[0] if arguments and isinstance(step, int) else None
-
-
-def _without_none(at: object) -> object:
-    """Return a type without `Annotated` and without its `| None`."""
-    while get_origin(at) is Annotated:
-        at = get_args(at)[0]
-    if get_origin(at) in (Union, UnionType):
-        arms = [arm for arm in get_args(at) if arm is not type(None)]
-        if len(arms) == 1:
-            return _without_none(arms[0])
-    return at
-
-
-def _names(arm: object) -> tuple[str, ...]:
-    """Return the names that pydantic uses in locations for a member of a union."""
-    tags = [note.tag for note in get_args(arm) if isinstance(note, Tag)]
-    plain = _without_none(arm)
-    return (*tags, plain.__name__) if isinstance(plain, type) else tuple(tags)

@@ -362,18 +362,19 @@ def pose_form() -> object:
     """Return the pydantic type of a pose: positions by joint, or the form of a feature.
 
     A pose in the form of a feature has a text that is not a quantity: with the feature's key or a foreign
-    term for it, or next to another key of the form; or all required keys, and no text at the feature's.
+    term for it, or with a list, next to another key of the form; or all required keys, without a text there.
     """
     forms = pose_stages()
 
     def kind_of_pose(pose: object) -> str:
         values = pose if isinstance(pose, dict) else {}
         texts = {key for key, at in values.items() if isinstance(at, str) and split_quantity(at) is None}
+        listed = any(isinstance(at, list) for at in values.values())  # such as `rpy`
         for one in forms:
             keys, named = one.form.model_fields.keys(), {one.name, *words_for(one.form.__name__, [one.name])}
             needed = {key for key, field in one.form.model_fields.items() if field.is_required()}
             is_whole = needed <= values.keys() and not isinstance(values.get(one.name, ""), str)
-            if texts & named or (texts - keys and values.keys() & keys) or is_whole:
+            if texts & named or ((texts - keys or listed) and values.keys() & keys) or is_whole:
                 return f"<{one.name}>"
         return "<joints>"
 

@@ -7,7 +7,7 @@ from functools import cache
 from types import UnionType
 from typing import Annotated, Union, cast, get_args, get_origin
 
-from pydantic import BaseModel, TypeAdapter
+from pydantic import BaseModel, Tag, TypeAdapter
 
 from dxlrun.description.base_form import PlugInEntry
 from dxlrun.errors import near
@@ -17,13 +17,17 @@ Place = tuple[str, ...]
 NAME = "NAME"
 
 
-def example_at(form: type[BaseModel], place: Place) -> str:
-    """Return the example of a key at a path below a model; empty if it has none."""
-    *above, key = place
-    for step in above:
-        form = next(_forms(_annotation(form, step)), form)
-    info = form.model_fields.get(key)
+def example_at(form: type[BaseModel], place: tuple[str | int, ...]) -> str:
+    """Return the example of a key at a path below a model, as written in a file; empty if it has none."""
+    owner = form_at(form, place[:-1]) if place else None
+    info = None if owner is None else owner.model_fields.get(str(place[-1]))
     return str(info.examples[0]) if info is not None and info.examples else ""
+
+
+def may_be_value(form: type[BaseModel], place: Place, value: object) -> bool:
+    """Return True if the key at a path below a model accepts a value, or if its type is not known."""
+    annotation = annotation_at(form, place)
+    return annotation is None or _takes(annotation, value)
 
 
 def places_of(root: type[BaseModel], key: str, value: object) -> list[Place]:
@@ -85,8 +89,7 @@ def _annotation(form: type[BaseModel], key: str) -> object:
 
 
 def _entries(annotation: object) -> object:
-    while get_origin(annotation) is Annotated:
-        annotation = get_args(annotation)[0]
+    annotation = without_none(annotation)
     return get_args(annotation)[1] if get_origin(annotation) is dict else None
 
 
@@ -127,3 +130,47 @@ def _takes(annotation: object, value: object) -> bool:
     except ValueError:  # pydantic's error for a refused value
         return False
     return True
+
+
+def form_at(model: type[BaseModel], location: tuple[str | int, ...]) -> type[BaseModel] | None:
+    """Return the model at pydantic's location; None if there is another type."""
+    at = without_none(annotation_at(model, location))
+    return at if isinstance(at, type) and issubclass(at, BaseModel) else None
+
+
+def annotation_at(model: type[BaseModel], location: tuple[str | int, ...]) -> object:
+    """Return the type, with metadata, of the value at pydantic's location."""
+    at: object = model
+    for step in location:
+        at = _inner(at, step)
+    return at
+
+
+def _inner(at: object, step: str | int) -> object:
+    at = without_none(at)
+    if get_origin(at) in (Union, UnionType):
+        return next((arm for arm in get_args(at) if step in _names(arm)), None)
+    if isinstance(at, type) and issubclass(at, BaseModel):
+        return _annotation(at, str(step))
+    arguments = get_args(at)
+    if get_origin(at) is dict:
+        return arguments[1]
+    return arguments[0] if arguments and isinstance(step, int) else None
+
+
+def without_none(at: object) -> object:
+    """Return a type without `Annotated` and without its `| None`."""
+    while get_origin(at) is Annotated:
+        at = get_args(at)[0]
+    if get_origin(at) in (Union, UnionType):
+        arms = [arm for arm in get_args(at) if arm is not type(None)]
+        if len(arms) == 1:
+            return without_none(arms[0])
+    return at
+
+
+def _names(arm: object) -> tuple[str, ...]:
+    """Return the names that pydantic uses in locations for a member of a union."""
+    tags = [note.tag for note in get_args(arm) if isinstance(note, Tag)]
+    plain = without_none(arm)
+    return (*tags, plain.__name__) if isinstance(plain, type) else tuple(tags)

@@ -24,6 +24,7 @@ from dxlrun.description.mistakes.forms import (
     keys_for,
     keys_of,
     may_be_entry,
+    may_be_value,
     places_of,
     section_of,
 )
@@ -165,13 +166,14 @@ class UnknownKeyContext(msgspec.Struct, frozen=True):
             return f"rename it to `{key}`"
         example = example_at(self.form, place)
         converted = _CONVERSIONS.get(meaning.kind or ".".join(place), _plain)(value, example)
-        if is_same and example.startswith("{") and not isinstance(value, dict):
+        if converted == (yaml_text(value), "") and not may_be_value(self.form, place, value):
             converted = None
         text, condition = converted or (example, "")
+        if not text:
+            return f"did you mean {key}?"
         such = "write" if converted is not None else "write for example"
-        if key in self.present:
-            return f"{such} `{place[-1]}: {text}` below `{key}`{condition}"
-        return f"{such} `{self._at(place, text)}`{condition}"
+        below = f"{place[-1]}: {text}` below `{key}" if key in self.present else self._at(place, text)
+        return f"{such} `{below}`{condition}"
 
     def _reference(self) -> str:
         measure = "`dxlrun calibrate ROBOT.yaml` measures it"
@@ -191,16 +193,15 @@ class UnknownKeyContext(msgspec.Struct, frozen=True):
         if not (places := places_of(self.root, ours, value)):
             ours = next(iter(near(key, keys_of(self.root))), ours)
             places = places_of(self.root, ours, value)
+        # `time` and `position` of a joint's tolerance are keys of many other forms.
+        places = [place for place in places if len(place) < 4 or self.path[:1] in ((), place[:1])]
         return self._moved(ours, value, places) if places else ""
 
     def _miswritten(self, key: str, value: object) -> str:
         """Return the fix for text that is not a key, such as `rate=50`; empty if it may be one."""
         word, sign, rest = (part.strip() for part in re.split(r"([:=]|$)", key, maxsplit=1))
         named = f"remove it: the entry already has the name {self.path[1]}" if len(self.path) == 2 else ""
-        is_joint = self.path[:1] == ("controllers",) and key in self.sections.get("joints", ())
-        if (key.endswith((")", "]")) or is_joint) and value is None:
-            fix = "write a list in square brackets: [a, b]"
-        elif re.match(r"\d+ *[a-z%]", key) and value is None:
+        if re.match(r"\d+ *[a-z%]", key) and value is None:
             fix = f"write a point instead of a decimal comma, such as 1.{key}, or a list in square brackets"
         elif re.fullmatch(r"\d{3}", key) and value is None:
             fix = "write the number without commas, such as 1_000_000"
@@ -359,10 +360,6 @@ def _direction(value: object, example: str) -> _Written:
 
 
 def _inverted(value: object, example: str) -> _Written:
-    return ("-1" if value else "1", "") if isinstance(value, bool | int) else None
-
-
-def _drive_mode(value: object, example: str) -> _Written:
     # Bit 0 of Drive Mode is Reverse Mode (e-Manual, Drive Mode).
     return ("-1" if value & 1 else "1", "") if isinstance(value, int) else None
 
@@ -396,7 +393,6 @@ _CONVERSIONS: Mapping[str, Callable[[object, str], _Written]] = {
     "direction": _direction,
     "ids": _ids,
     "inverted": _inverted,
-    "drive_mode": _drive_mode,
     "pair": _pair,
     "period": _rate,
     "pose": _point,
