@@ -56,6 +56,13 @@ def test_another_protocol_is_refused(serve):
     assert refused(serve().url, subprotocol="chat") == 400
 
 
+@pytest.fixture
+def patient(monkeypatch):
+    """Give handshakes more time than a server does: a busy machine can need longer than 5 s."""
+    monkeypatch.setattr("dxlrun_foxglove.foxglove_server.OPENING_S", 120.0)
+
+
+@pytest.mark.usefixtures("patient")
 @pytest.mark.parametrize("with_tls", [False, True])
 def test_half_open_connections_make_room_for_a_viewer(serve, certificate, with_tls):
     served = serve(tls=tls_of(*certificate) if with_tls else None)
@@ -90,10 +97,8 @@ def certificate(tmp_path_factory):
     return cert, key
 
 
-def test_with_a_certificate_there_is_nothing_without_tls(serve, certificate, monkeypatch):
-    monkeypatch.setattr(
-        "dxlrun_foxglove.foxglove_server.OPENING_S", 120.0
-    )  # a busy machine can need longer than 5 s
+@pytest.mark.usefixtures("patient")
+def test_with_a_certificate_there_is_nothing_without_tls(serve, certificate):
     cert, key = certificate
     served = serve(tls=tls_of(cert, key))
     known = ssl.create_default_context(cafile=cert)
