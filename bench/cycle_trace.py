@@ -107,10 +107,8 @@ def command_cycle() -> Calls:
     cycles = _cycles(COMMANDED, Trace(MailboxWriter(box)), Mailbox(box, RingWriter(answers)))
     os.close(box)
     os.close(answers)
-    taking = (
-        calls for calls in cycles if any(one.co_qualname == "Steering.execute_commands" for one in calls)
-    )
-    return min(taking, key=len)
+    name = "Steering.execute_commands"
+    return min((calls for calls in cycles if any(code.co_qualname == name for code in calls)), key=len)
 
 
 def _most_frequent(cycles: Sequence[Calls]) -> Calls:

@@ -24,6 +24,7 @@ from dxlrun_fleet.fleet_file import Agent
 START = "/robots/"
 """Path prefix before a robot's name. POST starts the robot; GET returns 200 if it runs."""
 _MAIN = ("-m", "dxlrun")
+"""Arguments of Python that run the `dxlrun` command."""
 _MOST_TOLD, _LINES_TOLD = 4096, 6  # Bytes and lines of a run's output in an answer
 
 

@@ -3,17 +3,20 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from msgspec import structs
 
+from dxlrun.channels.cycle import Torque
 from dxlrun.channels.logged_packets import LoggedPacket
 from dxlrun.log.columns import PacketColumns
 from dxlrun_analysis.finding import Finding
 from dxlrun_analysis.plan_excerpt import LoggedBus, LoggedServo
 from dxlrun_analysis.servos.exchanges import Pairing
-from dxlrun_analysis.servos.joint_states import JointStates
+from dxlrun_analysis.servos.joint_states import BINS, JointStates
 from dxlrun_analysis.servos.losses import Losses
 from dxlrun_analysis.servos.reply_times import ReplyTimes
 from dxlwire.packets import PacketKind
@@ -166,3 +169,22 @@ def test_an_adapter_that_is_late_is_named_with_its_timer_and_no_servo():
     assert (finding.code, finding.subject) == ("late_replies", "main")
     assert "probably by a latency timer of 16 ms: 100% of its exchanges" in finding.sentence
     assert finding.remedy.startswith("`echo 1 | sudo tee /sys/")
+
+
+def test_samples_wait_for_their_exchanges_and_a_linear_joint_is_binned_by_the_angle_of_its_servo():
+    count, share = 8, 0.01  # m per rad
+    kind = [(name, of, (1,)) for name, of in (("position", float), ("temperature", float), ("valid", bool))]
+    cycles = np.zeros(count, [("cycle", int), ("period_ns", int), *kind, ("torque", np.uint8, (1,))])
+    cycles["cycle"], cycles["period_ns"] = range(count), 20_000_000
+    cycles["position"][:, 0] = share * np.radians(5) * (np.arange(count) + 0.5)
+    cycles["valid"], cycles["torque"] = True, Torque.ON
+    states = JointStates((), ("lift",))
+    states.share[:] = share
+    for part in (cycles[:4], cycles[4:]):
+        log: Any = SimpleNamespace(cycles=part)
+        states.add_states(log)
+    found = [states.until(1), states.until(0, everything=True)]
+    assert [places.cycle.tolist() for places in found] == [[0, 1], [2, 3, 4, 5, 6, 7]]
+    angle = np.concatenate([places.bins[0, :, 0] for places in found])
+    assert angle.tolist() == [BINS // 2 + number for number in range(count)]
+    assert states.time_ns[0, 0].sum() == count * 20_000_000

@@ -332,7 +332,7 @@ def test_a_goal_that_was_put_where_its_joint_is_begins_from_rest():
     for torque, command in ((Torque.OFF, 0.001), (Torque.ON, 0.002)):
         rig.states.torque[:] = torque
         sent = rig.apply(position=command)
-    assert sent.position == pytest.approx(0.001), "what was commanded of the limp joint is no speed"
+    assert sent.position == pytest.approx(0.001), "the command of a limp joint is not a speed"
     assert rig_of(Mode.VELOCITY, eased=False).apply(velocity=0.05).velocity == 0.05
 
 

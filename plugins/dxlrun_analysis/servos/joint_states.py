@@ -24,7 +24,7 @@ QUANTITIES = ANGLE, SPEED, TEMPERATURE = range(3)
 _STEPS = np.array([math.radians(5), 0.1, 1.0])[:, None, None]  # rad, rad/s, deg C: width of a bin
 _FIRST = np.array([-BINS / 2, 0, 0])[:, None, None]  # Lower edge of the first bin, in bin widths
 _SAMPLE_NS = 20_000_000
-_MOST_HELD = 10_000  # Samples that wait for their exchanges; in a complete log they cover 20 s
+_MOST_HELD = 10_000  # Samples that wait for their exchanges: 200 s. In a complete log they wait for 20 s.
 _USABLE = ~np.isin(np.arange(256), OFFLINE)  # By the value of `torque`
 
 
